@@ -1,10 +1,10 @@
 """Output as plain arrays: ``.npz``, and CSV for a spreadsheet.
 
-One row for each row in: ``stamp_ns`` (T,), ``positions`` (T, 22, 3) metres in the input's frame, ``rotations``
-(T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly`` (T,),
-``anomaly_flag`` (T,), ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s,
-``world_positions`` (T, 22, 3) metres, and ``joint_names`` (22,). Where the prior gave no body, numbers are NaN and the
-state is UNKNOWN. With several bodies an axis for them comes after time, and ``body_id`` (B,) names them.
+The arrays have one row per input frame: ``stamp_ns`` (T,), ``positions`` (T, 22, 3) metres in the input's frame,
+``rotations`` (T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly``
+(T,), ``anomaly_flag`` (T,), ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s,
+``world_positions`` (T, 22, 3) metres, and ``joint_names`` (22,). Where the prior has no body, numbers are NaN and the
+state is UNKNOWN. For several bodies, an axis of bodies follows time, and ``body_id`` (B,) lists their ids.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from steadypose.msgs.types import JOINTS, JointState, Message, PoseClean, PoseWo
 from steadypose.nodes.graph.clock import FRAME_NS
 
 SLACK_NS = 1_000_000
-"""tolerance of a period: how far from a row of the grid its values are held"""
+"""Tolerance added to the frame period over which a grid row's values are held, nanoseconds."""
 
 _ROW = np.dtype(
     [
@@ -43,7 +43,7 @@ _NEAREST = ("state", "anomaly_flag")
 
 
 class NpzCollector:
-    """Gathers the output of both pipelines on their 30 Hz grid, and gives them at the stamps of the input."""
+    """Collects the output of both pipelines on the 30 Hz grid, and interpolates it at the stamps of the input."""
 
     def __init__(self, messages: Iterable[tuple[str, Message]] = ()) -> None:
         self._rows: dict[int, list[NDArray[np.void]]] = {}
@@ -52,7 +52,7 @@ class NpzCollector:
             self.add(message)
 
     def add(self, message: Message) -> None:
-        """Take the next message of the stream; of each moment ``pose/clean`` comes before ``pose/world``."""
+        """Add the next message of the stream. At each stamp, ``pose/clean`` must come before ``pose/world``."""
         if isinstance(message, PoseClean):
             self._newest = {}
             for body in message.bodies:
@@ -70,7 +70,7 @@ class NpzCollector:
                     row["contacts"] = body.contacts
 
     def arrays(self, stamps_ns: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """The arrays of the output at ``stamps_ns`` (T,), by name."""
+        """The output's arrays at ``stamps_ns`` (T,), by name."""
         tracks = [_at(np.stack(rows), stamps_ns) for rows in self._rows.values()]
         table = np.stack(tracks, axis=1) if tracks else _blank((len(stamps_ns), 1))
         several = len(tracks) > 1
@@ -90,7 +90,7 @@ def _blank(shape: tuple[int, ...]) -> NDArray[np.void]:
 
 
 def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void]:
-    """Rows of one body at other stamps: interpolated between neighbours of the grid, held for a period at its ends."""
+    """One body's rows at other stamps: interpolated between neighbours of the grid, held for one period at its ends."""
     grid = grid[np.unique(grid["stamp_ns"], return_index=True)[1]]
     after = np.searchsorted(grid["stamp_ns"], stamps_ns, side="right").clip(1, max(len(grid) - 1, 1))
     before, after = after - 1, np.minimum(after, len(grid) - 1)
@@ -98,7 +98,7 @@ def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void
     span = last - first
     fraction = (stamps_ns - first) / np.maximum(span, 1)
     nearest = np.where(np.abs(stamps_ns - first) <= np.abs(last - stamps_ns), before, after)
-    # a gap in the grid, and the ends, have one neighbour at most
+    # in a gap of the grid, and at its ends, there is at most one neighbour
     between = (span <= 1.5 * FRAME_NS) & (fraction >= 0) & (fraction <= 1)
     known = between | (np.abs(grid["stamp_ns"][nearest] - stamps_ns) <= FRAME_NS + SLACK_NS)
     before, after = np.where(between, before, nearest), np.where(between, after, nearest)
@@ -123,7 +123,7 @@ def _lerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.f
 
 
 def _slerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions (..., 4) on the shorter arc from ``a`` to ``b``."""
+    """Unit quaternions (..., 4), interpolated on the shorter arc from ``a`` to ``b``."""
     cosine = (a * b).sum(axis=-1, keepdims=True)
     b, angle = np.where(cosine < 0, -b, b), np.arccos(np.minimum(np.abs(cosine), 1.0))
     small = angle < 1e-4
@@ -138,7 +138,7 @@ _PARTS = ("x", "y", "z", "confidence", "state", "sigma")
 
 
 def write_csv(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays of `NpzCollector`, of one body or of several."""
+    """Write the arrays of `NpzCollector`, for one body or several, as CSV."""
     several = "body_id" in arrays
     columns = ["stamp", *(["body"] if several else [])]
     columns += [f"{joint}_{part}" for joint in JOINTS for part in _PARTS] + ["anomaly", "anomaly_flag"]
@@ -161,7 +161,7 @@ def _rows(arrays: Mapping[str, NDArray[Any]], several: bool) -> Iterator[list[st
     for row, stamp_ns in enumerate(arrays["stamp_ns"].tolist()):
         for body, number in enumerate(ids):
             if several and np.isnan(joints[row, body]).all():
-                continue  # who is not there has no row
+                continue  # absent bodies have no row
             cells = [f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}", *([str(number)] if several else [])]
             for joint in range(len(JOINTS)):
                 at = row, body, joint

@@ -1,6 +1,6 @@
-"""Sinks that send one person's pose as UDP datagrams: whom they follow, how they send, and VMC.
+"""Sinks that send one person's pose as UDP datagrams, and the VMC sink.
 
-VMC (Virtual Motion Capture) is OSC over UDP, for avatars in Unity, Unreal and others.
+VMC (Virtual Motion Capture) is a protocol of OSC over UDP, for avatars in Unity, Unreal and others.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.body.skeleton import PARENTS, VRM
 
 GONE_NS = 1_000_000_000
-"""absence, nanoseconds, after which another person is followed"""
+"""Time of absence after which another person is followed, nanoseconds."""
 
 
 @dataclass(frozen=True)
 class DatagramSettings:
-    """Where datagrams go."""
+    """The receiver of datagrams."""
 
     section: ClassVar[str]
-    """of a launch file"""
+    """the section in a launch file"""
 
     host: str = "127.0.0.1"
-    """where the datagrams go. Nobody is asked whether they may have them, and anybody on the way can read them"""
+    """address of the receiver; there is no access control, and anyone on the way can read the datagrams"""
     port: int = 0
-    """to which UDP port"""
+    """UDP port of the receiver"""
 
     def __post_init__(self) -> None:
         check_host_and_port(self.section, self.host, self.port)
 
 
 class Followed:
-    """The one person that is followed, until they are gone; then the next.
+    """Selects one person to follow until they are gone, then the next.
 
     Args:
-        body: the id of the only one to follow; None: the first who is there.
+        body: id of the only person to follow; None: the first one present.
 
     Attributes:
-        id: of who is followed; None before there was anybody.
+        id: id of the followed person; None until there was anybody.
     """
 
     def __init__(self, body: int | None = None) -> None:
@@ -57,7 +57,7 @@ class Followed:
         self._seen_ns: int | None = None
 
     def update(self, world: PoseWorld) -> WorldBody | None:
-        """The body to follow at a message's moment; None while it is not there."""
+        """The followed body in a message; None if it is absent."""
         bodies = {body.id: body for body in world.bodies if body.tracking != Tracking.LOST}
         gone = self._seen_ns is None or abs(world.stamp_ns - self._seen_ns) > GONE_NS
         if self.id not in bodies and gone and bodies and self._only is None:
@@ -76,7 +76,7 @@ class DatagramNode(Node):
 
     @abstractmethod
     def datagrams(self, world: PoseWorld) -> Sequence[bytes]:
-        """What is to be sent of a message: none before there was anybody."""
+        """The datagrams to send for a message."""
 
     def work(self) -> None:
         s = self._settings
@@ -93,7 +93,7 @@ class DatagramNode(Node):
             for datagram in datagrams:
                 self._socket.sendto(datagram, self._address)
             self._sent += bool(datagrams)
-        except OSError:  # nobody listens, or the way there is full: the next is newer
+        except OSError:  # nobody listens, or the network buffer is full; not repeated, because the next pose is newer
             self.health.counts["dropped.not sent"] += 1
 
     def status(self) -> dict[str, str]:
@@ -101,8 +101,8 @@ class DatagramNode(Node):
 
 
 BONES = tuple(name[0].upper() + name[1:] for name in VRM)
-"""(22,) as the protocol and Unity call them"""
-_A_BUNDLE = 11  # bones, so that a datagram is not taken apart on its way
+"""(22,) names of the bones in the protocol and in Unity."""
+_A_BUNDLE = 11  # messages per datagram, so that datagrams are not fragmented
 
 
 @dataclass(frozen=True)
@@ -112,16 +112,16 @@ class VmcSettings(DatagramSettings):
     section = "vmc"
 
     port: int = 39539
-    """to which UDP port: 39539 is what programs that play an avatar listen at"""
+    """UDP port of the receiver; 39539 is the usual port of programs that play an avatar"""
 
 
 def unity(body: WorldBody) -> tuple[Floats, Floats]:
-    """Where each bone is in its parent's frame, and how it is turned, in Unity's axes: x right, y up, z forward.
+    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward.
 
-    Unity's are left-handed: positions are mirrored, and with them the sense of every turn.
+    Unity's axes are left-handed, so positions are mirrored, and the sense of rotations is reversed.
 
     Returns:
-        (22, 3) metres, the hips' in the world, and (22, 4) xyzw.
+        (22, 3) metres, the hips in the world; and (22, 4) xyzw.
     """
     rotations = np.asarray(body.rotations, dtype=np.float64)
     world = global_rotations(rotation_matrices(rotations))
@@ -133,7 +133,7 @@ def unity(body: WorldBody) -> tuple[Floats, Floats]:
 
 
 class VmcNode(DatagramNode):
-    """Sends the pose of one person at a time, until they are gone."""
+    """Sends one person's pose by VMC, and follows that person until they are gone."""
 
     name = "vmc"
 
@@ -149,7 +149,7 @@ class VmcNode(DatagramNode):
 
 
 def osc_bundles(time_s: float, body: WorldBody | None) -> list[bytes]:
-    """A moment as OSC bundles: whether somebody is there, the time in seconds, and the bones of who is."""
+    """OSC bundles for one time: whether there is a person, the time in seconds, and the person's bones."""
     from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
     from pythonosc.osc_message_builder import build_msg
 

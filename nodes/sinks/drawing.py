@@ -1,4 +1,4 @@
-"""What the viewer and the plots share: the colours of joint states, the bones of a skeleton, the way to the world."""
+"""Shared by the viewer and the plots: colours, bones, and the transform to the world."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.types import CONTACTS, JOINTS, JointState, Pose
 from steadypose.prior.body.skeleton import PARENTS, J
 
-# Okabe and Ito's palette: told apart with any kind of colour vision, on white and on black.
+# Okabe and Ito's palette: distinguishable with any colour vision, on white and on black.
 STATE_COLOURS: dict[JointState, str] = {
     JointState.UNKNOWN: "#8c8c8c",
     JointState.SEEN: "#10a37f",
@@ -23,21 +23,21 @@ TRUTH_COLOUR = "#7f7f7f"
 CONTACT_COLOUR = "#f0c808"
 ALARM_COLOUR = "#d81b60"
 LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = "#0072b2", "#d55e00", "#3c3c3c"
-"""of a body's sides on white"""
+"""Colours of a body's sides on white."""
 DARK, ON_DARK = "#12141a", ("#56b4e9", "#f08c2e", "#d7dbe4")
-"""a dark background, and left, right and middle on it"""
+"""Colours of a dark background, and of left, right and middle on it."""
 FAINT = 0.3
-"""opacity of what was not observed"""
+"""Opacity of unobserved joints and bones."""
 
 CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
-"""(8,) canonical joints that the contact probabilities of ``pose/world`` are of."""
+"""(8,) canonical joints of the contact probabilities in ``pose/world``."""
 
 
 def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """The bones to draw between the canonical joints that a sensor can see.
+    """The bones to draw between the canonical joints that a sensor can observe.
 
-    A joint that a sensor's skeleton lacks is skipped: its children hang from its nearest ancestor. A joint that is
-    only missing for a moment is no reason to redraw the skeleton: leave out the bones that end in it.
+    A joint that the sensor's skeleton lacks is skipped, and its children are connected to its nearest ancestor. For a
+    joint that is missing only temporarily, leave out its bones instead.
 
     Args:
         observable: (22,) the canonical joints that the sensor's skeleton has.
@@ -60,25 +60,25 @@ ALL_BONES: NDArray[np.intp] = bones(np.ones(len(JOINTS), dtype=bool))
 
 
 SIDES: NDArray[np.intp] = np.array([0 if "left" in name else 1 if "right" in name else 2 for name in JOINTS])
-"""(22,) of each canonical joint: left, right, middle"""
+"""(22,) side of each canonical joint: 0 left, 1 right, 2 middle."""
 
 
 def bone_states(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(21,) state of each canonical bone: that of the less certain of its ends, unknown being the least certain."""
+    """(21,) state of each canonical bone: that of its less certain end. UNKNOWN is the least certain."""
     doubt = np.where(state == JointState.UNKNOWN, len(JointState), state)
     worse = doubt[ALL_BONES].max(axis=1)
     return np.where(worse == len(JointState), JointState.UNKNOWN, worse).astype(np.uint8)
 
 
 def to_world(positions: NDArray[np.floating], sensor_pose: Pose) -> NDArray[np.float64]:
-    """Positions (..., 3) in metres from a message's own frame to the z-up world; what is not finite becomes NaN."""
+    """Transform positions (..., 3) metres from a message's frame to the z-up world. Positions not finite become NaN."""
     rotation = Rotation.from_quat(sensor_pose.orientation)
     flat = np.where(np.isfinite(positions), positions, np.nan).astype(np.float64).reshape(-1, 3)
     return (rotation.apply(flat) + sensor_pose.position).reshape(positions.shape)
 
 
 def facing(positions: NDArray[np.floating]) -> NDArray[np.float64] | None:
-    """(3,) horizontal unit vector in which the hips and shoulders of (22, 3) world joints face; None if unseen."""
+    """(3,) horizontal unit vector in which the hips and shoulders of (22, 3) world joints face; None if unobserved."""
     across = np.nansum(
         [positions[J[f"left_{part}"]] - positions[J[f"right_{part}"]] for part in ("hip", "shoulder")], axis=0
     )

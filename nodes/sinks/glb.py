@@ -1,8 +1,8 @@
-"""GLB (glTF 2.0): an animated skeleton with a skin of one octahedron a bone, in metres, y up, facing +z.
+"""Writes GLB (glTF 2.0): an animated skeleton with a skin of one octahedron per bone, in metres, y up, facing +z.
 
-Joints are nodes, their rotations an animation, so that Blender, Unity, Unreal and browsers have bones to retarget; the
-skin is there to be seen. A VRM animation (.vrma) is the same file with the pose at rest in its nodes, and an extension
-that says which node is which bone of a humanoid (VRMC_vrm_animation 1.0).
+Joints are nodes and their rotations an animation, so that Blender, Unity, Unreal and browsers have bones to retarget.
+The skin makes the bones visible. A VRM animation (.vrma) is the same file with the rest pose in its nodes, and with an
+extension that maps nodes to a humanoid's bones (VRMC_vrm_animation 1.0).
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _KINDS = {np.dtype(np.float32): FLOAT, np.dtype(np.uint16): UNSIGNED_SHORT, np.dtype(np.uint8): UNSIGNED_BYTE}
 
 WAIST, WIDTH = 0.2, 0.08
-"""Of a bone: where its octahedron is widest, and half how wide, as Blender draws them."""
+"""Position of a bone's widest point, and its half width there, relative to the bone's length; as in Blender."""
 
 
 def to_glb(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
-    """The file's contents; ``names`` of the 22 joints."""
+    """The content of a GLB file; ``names`` are those of the 22 joints."""
     return _file(motion, names, at_rest=False)
 
 
 def to_vrma(motion: BodyMotion) -> bytes:
-    """The contents of a VRM animation, which plays on any VRM avatar."""
+    """The content of a VRM animation, which plays on any VRM avatar."""
     return _file(motion, VRM, at_rest=True)
 
 
@@ -62,7 +62,7 @@ def _file(motion: BodyMotion, names: Sequence[str], at_rest: bool) -> bytes:
     for joint, parent in enumerate(PARENTS[1:], start=1):
         rest[joint] = rest[parent] + offsets[joint]
     root = motion.root @ Y_UP.T
-    turns = motion.rotations[..., [1, 2, 0, 3]]  # the turn of axes exchanges them, and a rotation's vector with them
+    turns = motion.rotations[..., [1, 2, 0, 3]]  # a change of axes permutes a quaternion's vector part likewise
     start = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)) if at_rest else turns[0]
     place = np.array([0.0, -rest[:, 1].min(), 0.0]) if at_rest else root[0]
     nodes = [
@@ -102,7 +102,7 @@ def _humanoid(names: Sequence[str]) -> dict[str, Any]:
 
 
 class _Glb:
-    """The one buffer of a file, and what lies where in it."""
+    """The buffer of a file, with its views and accessors."""
 
     def __init__(self) -> None:
         self._views: list[BufferView] = []
@@ -110,7 +110,7 @@ class _Glb:
         self._data = bytearray()
 
     def add(self, values: NDArray[np.generic], target: int | None = None) -> int:
-        """The accessor of an array (N, width); numbers that are no integers become float32."""
+        """Add an array (N, width). Returns its accessor; floats are stored as float32."""
         values = values if values.dtype in _KINDS else values.astype(np.float32)
         self._data += bytes(-len(self._data) % 4)
         view = BufferView(buffer=0, byteOffset=len(self._data), byteLength=values.nbytes, target=target)
@@ -136,7 +136,7 @@ class _Glb:
 
 
 def _octahedra(rest: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.uint8]]:
-    """Points (126, 3), corners (504, 1) of triangles, and (126,) the joint that each point moves with."""
+    """Points (126, 3), indices (504, 1) of the triangles' corners, and the joint (126,) that each point moves with."""
     points: list[NDArray[np.float64]] = []
     triangles: list[list[int]] = []
     ring = [1, 2, 3, 4]

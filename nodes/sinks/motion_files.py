@@ -1,7 +1,7 @@
-"""One cleaned body at a steady rate, on bones that keep their lengths, as BVH, CSV or TRC.
+"""Writes one cleaned body at a constant rate, with constant bone lengths, as BVH, CSV or TRC.
 
-BVH: centimetres, y up, the rest pose a T that faces +z. CSV: as `nodes.sources.recording` reads it. TRC: as
-OpenSim does.
+BVH is in centimetres, y up, with a T pose that faces +z as rest pose. CSV is as `nodes.sources.recording` reads it. TRC
+is as OpenSim reads it.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from steadypose.prior.body.kinematics import forward_kinematics, global_rotation
 from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS, J
 
 Y_UP: Floats = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-"""From x forward, y left, z up to what animation programs have: x left, y up, z forward."""
+"""(3, 3) rotation from x forward, y left, z up to the axes of animation programs: x left, y up, z forward."""
 
 
 class ExportError(ValueError):
-    """There is no motion to export; the message says what was expected, what is there, and what to do."""
+    """There is no motion to export. The text says what was expected, what there is, and what to do."""
 
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """A body's motion.
+    """A body's motion at a constant frame rate.
 
     Attributes:
-        fps: frames a second.
+        fps: frame rate, Hz.
         root: (T, 3) metres, world, z up: the pelvis.
         rotations: (T, 22, 4) xyzw, local; the pelvis' to the world.
         offsets: (22, 3) metres, each joint in its parent's frame.
-        start_s: of the first frame's stamp.
+        start_s: stamp of the first frame, seconds.
     """
 
     fps: float
@@ -50,19 +50,19 @@ class BodyMotion:
 
     @property
     def positions(self) -> Floats:
-        """(T, 22, 3) metres, world, of these bones at these rotations."""
+        """(T, 22, 3) metres, world, by forward kinematics."""
         matrices = Rotation.from_quat(self.rotations.reshape(-1, 4)).as_matrix()
         return forward_kinematics(matrices.reshape(*self.rotations.shape[:2], 3, 3), self.offsets, self.root)[0]
 
 
 def read_motion(path: Path, body: int | None = None) -> BodyMotion:
-    """What ``steadypose clean`` has written, of one body.
+    """Read one body's motion from the output of ``steadypose clean``.
 
-    Frames stand at the rate of the stamps; what is missing between two is interpolated.
+    Its frame rate is that of the stamps. Gaps are interpolated.
 
     Args:
         path: a recording with ``pose/world``, or an ``.npz``.
-        body: its id; that which is there longest if left out.
+        body: the body's id; default: the one present the longest.
 
     Raises:
         ExportError: there is no such motion.
@@ -75,7 +75,7 @@ def read_motion(path: Path, body: int | None = None) -> BodyMotion:
 
 
 def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion:
-    """A motion at a steady rate, on bones of one length.
+    """Resample a motion to a constant rate, with constant bone lengths.
 
     Args:
         stamps_s: (T,) seconds, increasing.
@@ -91,7 +91,7 @@ def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion
 
 
 def _bones(positions: Floats, rotations: Floats) -> Floats:
-    """(22, 3) with which the rotations come nearest to the positions: each bone's median in its parent's frame."""
+    """(22, 3) metres, bones that fit rotations and positions best: each bone's median in its parent's frame."""
     matrices = Rotation.from_quat(rotations.reshape(-1, 4)).as_matrix().reshape(*rotations.shape[:2], 3, 3)
     parents = list(PARENTS[1:])
     bones = (positions[:, 1:] - positions[:, parents])[..., None]
@@ -130,7 +130,7 @@ def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
         place = ids.index(_chosen(path, Counter(there), body))
         seen, world, turned = seen[:, place], world[:, place], turned[:, place]
     stamps = read_stamps(path, arrays, len(seen)) / 1e9
-    # The rotations are to the sensor's frame; what turns that to the world is one rotation in all of the file.
+    # the rotations are in the sensor's frame; a single rotation transforms the whole file to the world
     known = np.isfinite(seen).all(axis=(1, 2)) & np.isfinite(world).all(axis=(1, 2))
     if known.any():
         shapes = [(p[known] - p[known][:, :1]).reshape(-1, 3) for p in (seen, world)]
@@ -156,11 +156,11 @@ ENDS = {
     "left_wrist": (17.0, 0.0, 0.0),
     "right_wrist": (-17.0, 0.0, 0.0),
 }
-"""Centimetres, x left, y up, z forward: how far head, feet and hands reach beyond their joints, of a generic adult."""
+"""Ends of head, feet and hands of a generic adult relative to their joints: x left, y up, z forward, centimetres."""
 
 
 def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
-    """The file's contents; ``names`` of the 22 joints."""
+    """The content of a BVH file; ``names`` are those of the 22 joints."""
     lines = ["HIERARCHY"]
     order: list[int] = []
 
@@ -185,7 +185,7 @@ def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
         lines.append("\t" * depth + "}")
 
     write(J["pelvis"], 0)
-    # The turn of axes, about a rotation on both sides: only its vector turns.
+    # a change of axes rotates a rotation's vector
     turns = Rotation.from_rotvec(Rotation.from_quat(motion.rotations[:, order].reshape(-1, 4)).as_rotvec() @ Y_UP.T)
     angles = turns.as_euler(ORDER, degrees=True).reshape(len(motion.root), -1)
     rows = np.concatenate([CENTIMETRES * motion.root @ Y_UP.T, angles], axis=1)
@@ -201,7 +201,8 @@ MILLIMETRES = 1000.0
 
 
 def to_csv(motion: BodyMotion) -> bytes:
-    """``stamp`` in seconds; of each joint ``_x _y _z`` in metres, world, z up, and ``_qx _qy _qz _qw``, local."""
+    """The content of a CSV: ``stamp`` in seconds; for each joint ``_x _y _z`` metres, world, z up, and local
+    ``_qx _qy _qz _qw``."""
     parts = ("x", "y", "z", "qx", "qy", "qz", "qw")
     rows = np.concatenate([motion.positions, motion.rotations], axis=-1).reshape(len(motion.root), -1)
     stamps = motion.start_s + np.arange(len(rows)) / motion.fps
@@ -215,7 +216,7 @@ def to_csv(motion: BodyMotion) -> bytes:
 
 
 def to_trc(motion: BodyMotion) -> bytes:
-    """Markers at the joints: millimetres, y up."""
+    """The content of a TRC file with markers at the joints: millimetres, y up."""
     rows = (MILLIMETRES * motion.positions @ Y_UP.T).reshape(len(motion.root), -1)
     frames, rate = len(rows), f"{motion.fps:g}"
     header = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame",

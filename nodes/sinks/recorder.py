@@ -1,7 +1,7 @@
-"""The recorder: topics into a rosbag2 directory.
+"""The recorder: writes topics to a rosbag2 directory.
 
-It runs for months: parts are split, the oldest removed where there is a limit, and where the disk has no room it drops
-messages and counts them, until there is room again. Started again, it goes on with the next part.
+It can run for months: it splits the recording into parts and removes the oldest beyond a limit. While the disk is full
+it drops and counts messages. After a restart it continues with the next part.
 """
 
 from __future__ import annotations
@@ -27,28 +27,29 @@ from steadypose.prior.settings import nearest
 logger = logging.getLogger(__name__)
 
 CHECK_NS = 1_000_000_000
-"""between two looks at how much room the disk has"""
+"""Interval between checks of the free disk space, nanoseconds."""
 QUIET_S = 0.3
-"""without a message after the stop, until all that was on its way has arrived"""
+"""Time without a message after which everything in flight has arrived, when the node stops, seconds."""
 
 
 @dataclass(frozen=True)
 class RecorderSettings:
-    """``[recorder]``: what is written, where."""
+    """``[recorder]``: what is recorded, and where."""
 
     directory: str = path_setting()
-    """the rosbag2 directory to make; a relative path starts at the launch file"""
+    """the rosbag2 directory to create; relative to the launch file"""
     topics: list[str] = field(default_factory=lambda: list(TOPICS))
     split_mb: float = 1000.0
-    """begin the next part at this size, MB; 0: never"""
+    """size at which the next part starts, MB; 0: never"""
     split_s: float = 3600.0
-    """begin the next part after so much of the stream, seconds; 0: never"""
+    """duration of the stream after which the next part starts, seconds; 0: never"""
     keep_mb: float = 0.0
-    """remove the oldest parts so that all have no more, MB; 0: keep all"""
+    """total size above which the oldest parts are removed, MB; 0: keep all"""
     free_mb: float = 500.0
-    """what is to be left of the disk, MB: with less, messages are dropped and counted"""
+    """free disk space below which messages are dropped and counted, MB"""
     sync_s: float = 5.0
-    """how much a power failure may cost, seconds; 0: what the operating system has not written yet"""
+    """interval of writing to the disk, which limits what a power failure can lose, seconds; 0: left to the operating
+    system"""
 
     def __post_init__(self) -> None:
         for topic in self.topics:
@@ -66,8 +67,10 @@ class RecorderSettings:
             )
 
     def writer(self) -> RecordingWriter:
-        """Raises:
-        RecordingError: the directory holds something else, or cannot be made.
+        """Open the recording for writing.
+
+        Raises:
+            RecordingError: the directory contains something else, or cannot be created.
         """
         return RecordingWriter(
             self.directory,
@@ -79,19 +82,21 @@ class RecorderSettings:
 
 
 def check_recorder(launch: Launch) -> None:
-    """Raises:
-    LaunchError: there is nothing to record to.
+    """Check the settings.
+
+    Raises:
+        LaunchError: no directory is set.
     """
     if not launch.settings(RecorderSettings).directory:
         raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
 
 
 def free_directory(launch: Launch) -> Path | None:
-    """Where to record instead of the directory of the settings; None: there.
+    """The directory to record to instead of the configured one; None if the configured one can be used.
 
-    A run that is started again goes on in the next part of the same recording: stamps rise, and limits hold for all
-    of it. What is replayed would have the same stamps again, so it gets a new directory; as does what finds something
-    else in its place.
+    A restarted live run continues the same recording with its next part, because stamps increase and limits apply to
+    the whole recording. A replay would repeat the same stamps, so it gets a new directory. So does a run whose
+    directory contains something else.
     """
     directory = launch.settings(RecorderSettings).directory
     wanted = Path(directory)
@@ -110,16 +115,16 @@ def _is_recording(directory: Path) -> bool:
 
 
 class LogTimes:
-    """MCAP's log times of messages, such that a recording plays in the order in which it came.
+    """Assigns MCAP log times with which a recording plays in the order of arrival.
 
-    That is the stamp of capture, or where a topic's stamps went back, the highest before.
+    The log time is the capture stamp or, if a topic's stamps went back, the highest stamp before.
     """
 
     def __init__(self) -> None:
         self._highest_ns: dict[str, int] = {}
 
     def next(self, topic: str, stamp_ns: int) -> int:
-        """Log time, nanoseconds, of the topic's next message, captured at ``stamp_ns``."""
+        """Log time of the topic's next message, captured at ``stamp_ns``; nanoseconds."""
         self._highest_ns[topic] = max(stamp_ns, self._highest_ns.get(topic, 0))
         return self._highest_ns[topic]
 
@@ -128,7 +133,7 @@ NO_ROOM = "dropped.no room on the disk"
 
 
 class RecorderNode(Node):
-    """Writes what is published, loses nothing, and completes the recording when it is stopped."""
+    """Records all published messages without loss, and completes the recording when it stops."""
 
     name = "recorder"
 
@@ -171,14 +176,14 @@ class RecorderNode(Node):
             self._no_room(error.strerror or str(error))
 
     def settle(self, timeout_s: float = 0.0) -> bool:
-        """As of every node; but only what would outlast this process counts as taken."""
+        """As in every node, but a message is acknowledged only once it would survive this process."""
         return False if self._writer.pending else super().settle(timeout_s)
 
     def handle(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
             return
         if isinstance(message, Diagnostics) and self._pose_ns is None:
-            # before the first pose, nobody knows what time it is in the stream
+            # the stream's time is unknown before the first pose
             self._before_first_pose.append(message)
             return
         if not isinstance(message, Diagnostics):
@@ -186,10 +191,10 @@ class RecorderNode(Node):
         waiting, self._before_first_pose = self._before_first_pose, []
         for diagnostics in waiting:
             self._write(DIAGNOSTICS, diagnostics, message.stamp_ns)
-        # a node that has not seen a pose yet reports at no time
+        # diagnostics of a node that has not received a pose have no stamp
         self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
         if not isinstance(message, Diagnostics) and message.end_of_stream:
-            self._flush()  # who hears that the stream has ended may stop this process
+            self._flush()  # this process may be stopped as soon as the end of the stream is known
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
         self._look_at_disk()

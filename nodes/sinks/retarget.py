@@ -1,13 +1,13 @@
-"""A person's motion as a robot's, frame by frame: inverse kinematics by one small quadratic program a frame (mink).
+"""Retargets a person's motion to a robot: inverse kinematics by one small quadratic program per frame (mink).
 
-Directions of limbs, orientations of pelvis, chest and feet are the person's; lengths are the robot's, and so is the
-ground that is covered, in proportion to the legs. A foot that stands is held where it is, flat, until it lifts.
-Position and speed limits are constraints of the program, not penalties: they hold for every frame. The sink sends the
-newest pose as a JSON datagram for each message of ``pose/world``.
+The robot takes over the directions of the person's limbs and the orientations of pelvis, chest and feet. Its lengths
+are its own, and distances on the floor are scaled by the ratio of the legs' lengths. A standing foot is held in place,
+flat, until it lifts. Position and speed limits are constraints of the program, not penalties, so they hold in every
+frame. The sink sends the newest pose as a JSON datagram for each message of ``pose/world``.
 """
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-# an optional extra, which need not be installed; MuJoCo's module has no stubs
+# an optional extra that may not be installed; MuJoCo's module has no stubs
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ from steadypose.prior.sim.gait import minimum_jerk
 
 @dataclass(frozen=True)
 class RetargetSettings(DatagramSettings):
-    """``[retarget]``: a person's motion as a robot's, as JSON datagrams."""
+    """``[retarget]``: a person's motion retargeted to a robot, as JSON datagrams."""
 
     section = "retarget"
 
     urdf: str = path_setting()
-    """of the robot"""
+    """URDF file of the robot"""
     links: dict[str, str] = field(default_factory=dict)
-    """the link that plays a part of the body, such as ``left_foot``, where its name does not tell"""
+    """part of the body, such as ``left_foot``, to the robot's link, where the link's name does not show it"""
     sole: float = 0.0
-    """metres from the floor to the origins of the foot links, when they stand"""
+    """height of the foot links' origins above the floor when standing, metres"""
     port: int = 8767
-    """to which UDP port"""
+    """UDP port of the receiver"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -55,8 +55,10 @@ class RetargetSettings(DatagramSettings):
 
 
 def check_retarget(launch: Launch) -> None:
-    """Raises:
-    LaunchError: there is no such robot.
+    """Check that the robot's URDF can be used.
+
+    Raises:
+        LaunchError: no URDF is set, or it cannot be used.
     """
     settings = launch.settings(RetargetSettings)
     if not settings.urdf:
@@ -65,7 +67,7 @@ def check_retarget(launch: Launch) -> None:
 
 
 def datagram(pose: RobotPose, joints: tuple[str, ...]) -> bytes:
-    """A pose as JSON: stamp in seconds of capture, root link in the world (metres, xyzw), joints by name."""
+    """A pose as JSON: capture time in seconds, root link in the world (metres, xyzw), joints by name."""
     return json.dumps(
         {
             "stamp": pose.stamp_ns / 1e9,
@@ -78,7 +80,7 @@ def datagram(pose: RobotPose, joints: tuple[str, ...]) -> bytes:
 
 
 class RetargetNode(DatagramNode):
-    """Sends a robot's poses."""
+    """Sends a robot's poses as datagrams."""
 
     name = "retarget"
 
@@ -96,35 +98,36 @@ class RetargetNode(DatagramNode):
 
 SIDES = ("left", "right")
 ANKLE = 0.07
-"""metres of a person's ankle above the floor it stands on"""
+"""Height of a person's ankle above the floor when standing, metres."""
 CROUCH = 0.98
-"""share of the legs' length that the robot stands with: straight knees are singular"""
+"""Height of the standing robot's hips relative to its legs' length, ratio. It is below 1 because straight knees are
+singular."""
 EASE_S = 1.0
-"""to begin, and to stop"""
+"""Time to ease into following a person, and to come to rest, seconds."""
 RELEASE_S = 0.15
-"""in which a foot that lifts goes over from where it stood to where the person's is"""
+"""Time in which a lifting foot moves from where it stood to its target, seconds."""
 STANDS, LIFTS = 0.6, 0.4
-"""probability of contact from which on a foot stands, and below which it lifts"""
+"""Contact probabilities above which a foot stands, and below which it lifts."""
 TOO_FAR = 0.3
-"""metres between a standing foot and the person's, at which it is let go all the same"""
+"""Distance between a standing foot and its target at which it is released anyway, metres."""
 MARGIN = 1e-4
-"""radians or metres that stay between a joint and its limit, for rounding"""
+"""Distance kept between a joint and its limit against rounding, radians or metres."""
 
 
 class RobotPose(NamedTuple):
-    """A robot at one moment."""
+    """A robot's pose at one time."""
 
     stamp_ns: int
     root: Floats
-    """(7,) metres and xyzw: the root link in the world"""
+    """(7,) pose of the root link in the world: metres and xyzw"""
     joints: Floats
     """(N,) radians or metres, in the order of `Robot.joints`"""
     stands: tuple[bool, bool]
-    """which feet are held where they stand: left, right"""
+    """whether the left and the right foot are held in place"""
 
 
 class _Foot:
-    """One foot: where it stands, or how far it is on its way."""
+    """The state of one foot: where it stands, or its progress of being released (``free``, 0 to 1)."""
 
     def __init__(self) -> None:
         self.stood: tuple[Floats, Floats] | None = None
@@ -136,11 +139,11 @@ class _Foot:
 
 
 class Retargeter:
-    """Follows one person.
+    """Retargets one person's motion to a robot.
 
     Args:
-        robot: that does as they do.
-        sole: metres from the floor to the origins of its foot links, when they stand.
+        robot: the robot.
+        sole: height of its foot links' origins above the floor when standing, metres.
     """
 
     def __init__(self, robot: Robot, sole: float = 0.0) -> None:
@@ -186,14 +189,14 @@ class Retargeter:
         return tasks
 
     def reset(self) -> None:
-        """Forget the person: the next is begun with anew."""
+        """Forget the person, so that the next one is started afresh."""
         self._stamp_ns = None
         self._velocity[:] = 0.0
         for foot in self._feet:
             foot.reset()
 
     def follow(self, stamp_ns: int, body: WorldBody) -> RobotPose | None:
-        """The robot's pose for the person's at ``stamp_ns``; None of a pose that is not known, or not later."""
+        """The robot's pose for a person's at ``stamp_ns``; None if that is unknown, or not later than the last."""
         if not np.isfinite(body.positions).all() or not np.isfinite(body.rotations).all():
             return None
         if self._stamp_ns is None:
@@ -211,25 +214,25 @@ class Retargeter:
         return self._pose(stamp_ns)
 
     def coast(self, stamp_ns: int) -> RobotPose | None:
-        """The pose at ``stamp_ns`` when there is nobody to follow: the robot comes to rest, and stays."""
+        """The pose at ``stamp_ns`` while there is nobody to follow: the robot comes to rest and stays there."""
         if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
             return None
         dt = min((stamp_ns - self._stamp_ns) / 1e9, EASE_S)
         self._velocity *= np.exp(-5.0 * dt / EASE_S)
-        self._stamp_ns = self._began_ns = stamp_ns  # who comes back is eased into
+        self._stamp_ns = self._began_ns = stamp_ns  # so that a person who returns is eased into
         for foot in self._feet:
             foot.reset()
         self._integrate(self._velocity, dt)
         return self._pose(stamp_ns)
 
     def _begin(self, stamp_ns: int, body: WorldBody) -> None:
-        """Stand where the person is, turned as they are; the joints go on from where they are."""
+        """Place the robot at the person's position and heading. Its joints continue from their current values."""
         p = body.positions.astype(np.float64)
         human = np.mean([_length(p, f"{side}_hip", f"{side}_knee", f"{side}_ankle") for side in SIDES])
         self._scale = float(np.mean([sum(leg) for leg in self._leg]) / max(human, 0.1))
         forward = rotation_matrix(body.root_orientation)[:, 0]
         yaw = np.arctan2(forward[1], forward[0])
-        q = self._configuration.q.copy()  # at first as at home; with the next person, as it is
+        q = self._configuration.q.copy()  # the home pose at first, the current pose for the next person
         low = min(self._rest[f"{side}_foot"][1][2] for side in SIDES)
         q[:3] = [*(self._scale * p[0, :2]), self._sole - low + self._home[2]]
         q[3:7] = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
@@ -257,7 +260,7 @@ class Retargeter:
             self._set(f"{side}_foot", *self._held(k, turn, place, float(touching), dt, begun=begun))
 
     def _to_robot(self, point: Floats) -> Floats:
-        """A point (3,) of the person's in the robot's smaller, or larger, world."""
+        """A point (3,) of the person, scaled to the robot's world."""
         return self._scale * (point - [0.0, 0.0, ANKLE]) + [0.0, 0.0, self._sole]
 
     def _foot_target(self, turn: Floats, ankle: Floats, k: int) -> tuple[Floats, Floats]:
@@ -268,7 +271,7 @@ class Retargeter:
     def _held(
         self, k: int, turn: Floats, place: Floats, touching: float, dt: float, *, begun: bool
     ) -> tuple[Floats, Floats]:
-        """Where a foot is to be: where it stands, or where the person's is, or on the way there."""
+        """A foot's target: where it stands, the person's foot, or in between while it is released."""
         foot = self._feet[k]
         far = foot.stood is not None and float(np.linalg.norm((foot.stood[1] - place)[:2])) > TOO_FAR
         stands = begun and not far and touching > (LIFTS if foot.stands else STANDS)
@@ -331,18 +334,18 @@ def _length(p: Floats, *joints: str) -> float:
 
 
 class Follower:
-    """The robot's poses for a stream of ``pose/world``: as one person, until they are gone.
+    """Computes a robot's poses for a stream of ``pose/world``, following one person until they are gone.
 
     Args:
-        retargeter: of the robot.
-        body: the id of the one to follow; None: the first who is there, then the next.
+        retargeter: the robot's retargeter.
+        body: id of the person to follow; None: the first one present, then the next.
     """
 
     def __init__(self, retargeter: Retargeter, body: int | None = None) -> None:
         self._retargeter, self._followed = retargeter, Followed(body)
 
     def process(self, world: PoseWorld) -> RobotPose | None:
-        """The pose at a message's moment; None before there was anybody."""
+        """The pose at a message's stamp; None until there was anybody."""
         before = self._followed.id
         body = self._followed.update(world)
         if self._followed.id != before:

@@ -1,10 +1,10 @@
-"""A humanoid from its URDF: joints, ranges, speeds, and which of its links play which part of a person's body.
+"""Reads a humanoid from its URDF: joints, ranges, speeds, and which link corresponds to which part of the body.
 
-Only the kinematics are read: meshes need not be there. The floating base is put in here, as a URDF has none.
+Only the kinematics are read; meshes may be missing. A floating base is added, because a URDF has none.
 """
 
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-# an optional extra, which need not be installed; MuJoCo's module has no stubs
+# an optional extra that may not be installed; MuJoCo's module has no stubs
 
 from __future__ import annotations
 
@@ -38,21 +38,22 @@ _PARTS = {
     "wrist": r"wrist|hand|palm",
 }
 _LAST = ("foot", "wrist")
-"""parts with several links in a row, of which the last counts; of the others the first does"""
+"""Parts for which the last of several matching links is used; for all others it is the first."""
 PARTS = ("pelvis", "torso", *(f"{side}_{part}" for side in _SIDES for part in _PARTS))
-"""the parts of a person's body that links play"""
+"""Parts of the body that correspond to links."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A humanoid.
+    """A humanoid robot.
 
     Attributes:
-        model: of MuJoCo, with a free joint under the root link.
-        joints: (N,) names of the joints that move, in the model's order.
-        lower, upper: (N,) radians or metres, as the URDF has them.
-        speed: (N,) rad/s or m/s.
-        links: the link that plays each of `PARTS`.
+        model: MuJoCo's model, with a free joint under the root link.
+        joints: (N,) names of the moving joints, in the model's order.
+        lower: (N,) lower limits from the URDF, radians or metres.
+        upper: (N,) upper limits from the URDF, radians or metres.
+        speed: (N,) largest speeds, rad/s or m/s.
+        links: link of each part in `PARTS`.
     """
 
     model: mujoco.MjModel
@@ -67,11 +68,11 @@ def load_robot(path: Path, links: Mapping[str, str]) -> Robot:
     """Read a URDF.
 
     Args:
-        path: of the file.
-        links: the link that plays a part, where its name does not tell.
+        path: path of the file.
+        links: part to link, where the link's name does not show it.
 
     Raises:
-        LaunchError: it cannot be read, a joint has no limits, or no link is found for a part.
+        LaunchError: the file cannot be read, a joint has no limits, or no link is found for a part.
     """
     import mujoco
 
@@ -121,7 +122,7 @@ def _limits(root: ET.Element, path: Path) -> dict[str, tuple[float, float, float
 
 
 def _prepare(root: ET.Element) -> None:
-    """Leave nothing but the kinematics."""
+    """Remove everything but the kinematics, in place."""
     for link in [*root, *root.findall("link")]:
         for shape in _SHAPES:
             for element in link.findall(shape):
@@ -130,14 +131,14 @@ def _prepare(root: ET.Element) -> None:
         for element in root.findall(shape):
             root.remove(element)
     settings = ET.SubElement(root, "mujoco")
-    # masses take no part in kinematics, and a link without one is no reason to refuse a robot
+    # kinematics need no masses, so a link without one must not make MuJoCo refuse the robot
     ET.SubElement(
         settings, "compiler", fusestatic="false", balanceinertia="true", boundmass="0.01", boundinertia="0.0001"
     )
 
 
 def _links(path: Path, bodies: list[str], base: str, given: Mapping[str, str]) -> dict[str, str]:
-    """The link of each part; bodies come parents first."""
+    """The link of each part. ``bodies`` are ordered with parents first."""
     if unknown := given.keys() - set(PARTS):
         raise LaunchError(f"links: no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
     found = {

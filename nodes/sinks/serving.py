@@ -1,8 +1,8 @@
-"""Who may see what the viewer and the web page serve: under which names they are called, and who has the token.
+"""Access control of the viewer and the web page: accepted host names, and tokens.
 
-A picture of people is not for everybody with a login: any user of the machine can connect to its loopback ports, and
-any page in a browser can, once its own name is made to lead here (DNS rebinding). So poses need a token, and no request
-is answered that names another host.
+Any user of a machine can connect to its loopback ports, and so can any web page in a browser whose host name is made to
+resolve to this machine (DNS rebinding). Poses of people therefore require a token, and requests for other host names
+are refused.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ from collections.abc import Collection
 from urllib.parse import urlsplit
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-"""hosts that only this machine reaches"""
+"""Host names that only this machine can reach."""
 
 
 def own_names(host: str, *others: str) -> frozenset[str]:
-    """The names of a server at ``host``: this machine's, and others that lead here."""
+    """The names of a server at ``host``: ``host``, this machine's names, and ``others``."""
     return frozenset(name.lower() for name in ("localhost", host, socket.gethostname(), *others))
 
 
 def called(header: str | None, names: Collection[str]) -> str | None:
-    """The host and port of a request's ``Host``, if they are this machine: an address, which leads where it says, or
-    one of ``names``; else None."""
+    """Host and port of a request's ``Host`` header, if it is an IP address or one of ``names``; otherwise None.
+
+    An IP address is safe, because no DNS is involved.
+    """
     try:
         parts = urlsplit(f"//{header or ''}")
         name, port = parts.hostname or "", parts.port or 80
@@ -39,12 +41,12 @@ def called(header: str | None, names: Collection[str]) -> str | None:
 
 
 def is_token(given: str, token: str) -> bool:
-    """Compares in a time that does not tell how much of it is right."""
+    """Compare tokens in constant time."""
     return hmac.compare_digest(given.encode(), token.encode())
 
 
 def shown(host: str) -> str:
-    """A host as it stands in a printed address: this machine's name for all its addresses."""
+    """A host for a printed address; an unspecified address (0.0.0.0, ::) becomes this machine's name."""
     try:
         return socket.gethostname() if ipaddress.ip_address(host).is_unspecified else in_url(host)
     except ValueError:
@@ -56,7 +58,7 @@ def in_url(host: str) -> str:
 
 
 def port_taken(section: str, host: str, port: int, error: OSError) -> str:
-    """What to say of a port that cannot be opened."""
+    """The error text for a port that cannot be opened."""
     return (
         f"[{section}] port {port} at {host} is not to be had ({error.strerror}): another one may be running; close it, "
         f"or set another [{section}] port"

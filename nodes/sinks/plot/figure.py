@@ -1,4 +1,4 @@
-"""The pictures: of a recording, of what was completed, and of how far a fit lies from what was observed."""
+"""The figures: of a recording, of a completion, and of the residuals of a fit."""
 
 from __future__ import annotations
 
@@ -34,13 +34,15 @@ if TYPE_CHECKING:
 
 STRIP = 2.8
 TITLE = 0.45
-"""inches: the strip of figures, and the title of a panel"""
+"""Heights of the strip of stick figures and of a panel's title, inches."""
 PICTURES = (".png", ".svg", ".pdf")
 
 
 def check_picture(output: Path, endings: tuple[str, ...] = PICTURES) -> None:
-    """Raises:
-    PlotError: this is no name for a picture, or its folder is not there.
+    """Check the name of an output file.
+
+    Raises:
+        PlotError: its suffix is not one of ``endings``, or its folder does not exist.
     """
     if output.suffix not in endings:
         raise PlotError(f"output: expected a name ending in {', '.join(endings[:-1])} or {endings[-1]}, got {output}")
@@ -49,16 +51,16 @@ def check_picture(output: Path, endings: tuple[str, ...] = PICTURES) -> None:
 
 
 def save(figure: Figure, output: Path) -> None:
-    """Write a picture; raises as `check_picture`."""
+    """Write a figure to a file; raises as `check_picture`."""
     check_picture(output)
     figure.savefig(output, dpi=110)
 
 
 def draw(history: History, body: int | None = None) -> Figure:
-    """Draw one body, and the way over the floor of all.
+    """Draw one body of a recording, and the paths of all bodies over the floor.
 
     Raises:
-        PlotError: as `body_of`.
+        PlotError: as in `body_of`.
     """
     from matplotlib.figure import Figure
 
@@ -96,7 +98,7 @@ _GIVEN, _COMPLETED = STATE_COLOURS[JointState.SEEN], STATE_COLOURS[JointState.IM
 
 
 def draw_completion(completion: Completion, title: str) -> Figure:
-    """Draw the longest stretch that was completed: joints given when, stick figures, the trajectory."""
+    """Draw the longest completed stretch: which joints were given when, stick figures, and the trajectory."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
@@ -128,8 +130,12 @@ def draw_completion(completion: Completion, title: str) -> Figure:
 
 
 def draw_misfit(fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> Figure:
-    """Draw how far joints lie from where they were seen, in this unit: of each body its id, stamps (T,) and misfit
-    (T, 22)."""
+    """Draw the distances between fitted and observed joints.
+
+    Args:
+        fits: for each body its id, stamps (T,) in nanoseconds, and distances (T, 22); the fourth entry is not used.
+        unit: unit of the distances.
+    """
     from matplotlib.figure import Figure
 
     shown = fits[:6]

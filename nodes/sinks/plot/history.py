@@ -1,4 +1,4 @@
-"""A recording as arrays, each body on each topic, a row a message; and its errors against the truth, if it has one."""
+"""A recording as arrays per body and topic, one row per message; and its errors against the ground truth, if any."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 
 SENSOR = {"sensor.jitter_mm", "sensor.slow_error_mm"}
-"""diagnostics of the prior"""
+"""Keys of the prior's diagnostics with the estimated sensor noise."""
 _NONE = np.zeros(0)
 
 
 class Track(NamedTuple):
-    """One body on one topic, a row a message. Positions are in the world."""
+    """One body on one topic, one row per message. Positions are in the world."""
 
     time: NDArray[np.float64]
     """(T,) seconds since the recording's first stamp"""
     positions: NDArray[np.float64]
     """(T, 22, 3) metres; NaN where unobserved"""
     raw: NDArray[np.float64]
-    """(T, 22, 3) what went in; empty but on `pose/clean`"""
+    """(T, 22, 3) metres, the input joints; empty except on `pose/clean`"""
     state: NDArray[np.uint8]
     """(T, 22) `JointState`"""
     sigma: NDArray[np.float64]
@@ -54,20 +54,20 @@ class History:
 
     name: str
     stamps: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    """topic to (T,) seconds"""
+    """stamps by topic: (T,) seconds since the recording's first stamp"""
     tracks: dict[str, dict[int, Track]] = field(default_factory=dict)
-    """topic and body to its track"""
+    """tracks by topic and body"""
     calibrated: bool = True
-    """whether the camera's place in the world is known"""
+    """whether the camera's position in the world is known"""
     reported: bool = False
     """whether diagnostics were recorded"""
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
-    """(22,) the joints that the sensor has at all"""
+    """(22,) whether the sensor's layout has each joint"""
     origin: str = ""
     sensor: dict[str, list[float]] = field(default_factory=dict)
-    """what the prior found the sensor to be off by, each second: ``jitter_mm`` and ``slow_error_mm``"""
+    """sensor noise estimated by the prior, each second: ``jitter_mm`` and ``slow_error_mm``"""
     dropped_or_refused: Counter[str] = field(default_factory=Counter)
-    """dropped and refused messages by node and cause, as the nodes counted them; and what could not be read"""
+    """dropped and refused messages by node and cause, as counted by the nodes; and unreadable messages"""
 
     def track(self, topic: str, body: int) -> Track | None:
         return self.tracks.get(topic, {}).get(body)
@@ -77,7 +77,7 @@ class History:
         return sorted({body for tracks in self.tracks.values() for body in tracks})
 
     def longest(self) -> int | None:
-        """The body with the most messages on the furthest topic that has any."""
+        """The body with the most messages on the first of clean, world, raw and truth that has any."""
         for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH):
             if bodies := self.tracks.get(topic):
                 return max(bodies, key=lambda body: len(bodies[body].time))
@@ -85,7 +85,7 @@ class History:
 
 
 def read_history(recording: Path) -> History:
-    """A recording as arrays."""
+    """Read a recording as arrays."""
     with RecordingReader(recording) as reader:
         history = gather(reader.path.name, reader, reader.start_ns)
         history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
@@ -95,20 +95,20 @@ def read_history(recording: Path) -> History:
 
 
 def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
-    """What ``clean``, ``complete`` or ``fit`` gave as arrays; or, of an input, what went in.
+    """The history of an output of ``clean``, ``complete`` or ``fit`` given as arrays; or of an input.
 
     Raises:
-        NpzError: they are neither.
+        NpzError: the arrays are neither an output nor an input.
     """
     messages = as_messages(arrays) if is_output(arrays) else ArraySource(Path(name), arrays)
     return _of_source(name, messages)
 
 
 def history_of_path(path: Path) -> History:
-    """A recording, or a file of poses.
+    """The history of a recording, or of a file of poses.
 
     Raises:
-        RecordingError, or as `open_recording`: it cannot be read.
+        RecordingError, or as `open_recording`: the path cannot be read.
     """
     if path.suffix == ".npz" and path.exists():
         return history_of_arrays(read_arrays(path), path.name)
@@ -123,7 +123,7 @@ def _of_source(name: str, messages: Iterable[tuple[str, Message]]) -> History:
 
 
 def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: int) -> History:
-    """Messages as arrays, each with its topic and stamp; ``name`` is the stream's, which begins at ``start_ns``."""
+    """Collect messages, each with topic and stamp, as arrays of the stream ``name``, which starts at ``start_ns``."""
     rows: dict[tuple[str, int], list[tuple[Any, ...]]] = {}
     stamps: dict[str, list[float]] = {}
     dropped_or_refused: dict[str, Mapping[str, str]] = {}
@@ -134,7 +134,7 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
         if isinstance(message, Diagnostics):
             dropped_or_refused[message.node] = message.values
             for key in SENSOR & message.values.keys():
-                with suppress(ValueError):  # of a recording that others wrote
+                with suppress(ValueError):  # the recording may come from another program
                     history.sensor.setdefault(key.removeprefix("sensor."), []).append(float(message.values[key]))
             continue
         if message.end_of_stream or isinstance(message, PoseEvents):
@@ -165,7 +165,7 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
 
 
 def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tuple[int, tuple[Any, ...]]]:
-    """Each body of a message, and its row of every field of `Track`."""
+    """Id and row (the fields of `Track`) of each body in a message."""
     if isinstance(message, PoseRaw):
         skeleton = SKELETONS.get(message.skeleton)
         for body in message.bodies if skeleton else ():
@@ -185,18 +185,18 @@ def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tup
 
 
 MAX_TRUTH_GAP_S = 0.05
-"""the furthest that a true pose may be from the stamp it is compared at"""
+"""Largest time between a pose and the ground truth it is compared with, seconds."""
 
 
 class TrackError(NamedTuple):
-    """How far a track is from the truth."""
+    """Error of a track against the ground truth."""
 
     time: NDArray[np.float64]
     """(T,) seconds"""
     mean: NDArray[np.float64]
-    """(T,) metres, over the joints given"""
+    """(T,) metres, mean over the joints present"""
     by_joint: NDArray[np.float64]
-    """(22,) metres, over time"""
+    """(22,) metres, mean over time"""
 
 
 def errors_of(history: History, body: int) -> dict[str, TrackError]:
@@ -211,17 +211,19 @@ def errors_of(history: History, body: int) -> dict[str, TrackError]:
         means = np.stack([nan_mean(distances, axis=1) for distances in joints])
         some = np.flatnonzero(np.isfinite(means).any(axis=0))
         if len(some):
-            # the sensor's ids need not be those of the truth: the nearest person is the one that is meant
+            # the sensor's ids may differ from the ground truth's, so compare with the nearest person
             nearest = np.nanargmin(means[:, some], axis=0)
             found[topic] = TrackError(track.time[some], means[nearest, some], nan_mean(joints[nearest, some], axis=0))
     return found
 
 
 def _distances(track: Track, truth: Track, *, placed: bool) -> NDArray[np.float64]:
-    """(T, 22) metres from a track's joints to the true ones at the same moments; NaN where either is missing.
+    """(T, 22) distances between a track's joints and the ground truth at the same times, metres; NaN where missing.
 
     Args:
-        placed: whether the track's place in the world is known; if not, it is first put where it fits best.
+        track: the track.
+        truth: one person's ground truth.
+        placed: whether the track's position in the world is known; otherwise it is first aligned to the truth.
     """
     index = np.clip(np.searchsorted(truth.time, track.time), 1, len(truth.time) - 1)
     before, after = truth.time[index - 1], truth.time[index]
@@ -234,7 +236,7 @@ def _distances(track: Track, truth: Track, *, placed: bool) -> NDArray[np.float6
 
 
 def _aligned(positions: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions (T, 22, 3), shifted and turned about the vertical, once for all, to where they fit the expected."""
+    """Positions (T, 22, 3) after the translation and rotation about the vertical that best fit the expected ones."""
     both = np.isfinite(positions).all(axis=2) & np.isfinite(expected).all(axis=2)
     if not both.any():
         return positions
@@ -246,7 +248,7 @@ def _aligned(positions: NDArray[np.float64], expected: NDArray[np.float64]) -> N
 
 
 def nan_mean(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """The mean of what is not NaN; NaN where all is."""
+    """Mean over an axis without NaN; NaN where all values are NaN."""
     counted = np.isfinite(values)
     total = np.where(counted, values, 0.0).sum(axis=axis)
     number = counted.sum(axis=axis)
@@ -254,14 +256,14 @@ def nan_mean(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
 
 
 class PlotError(ValueError):
-    """What was asked for cannot be drawn. The text says why."""
+    """A plot that cannot be drawn. The text says why."""
 
 
 def body_of(history: History, body: int | None) -> int:
-    """The body to draw: the one asked for, or the one seen the longest.
+    """The body to draw: the requested one, or the one observed the longest.
 
     Raises:
-        PlotError: there is none, or no such.
+        PlotError: there are no bodies, or not the requested one.
     """
     chosen = history.longest() if body is None else body
     if chosen is None:

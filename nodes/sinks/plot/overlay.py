@@ -22,20 +22,20 @@ from steadypose.nodes.sources.webcam_device import stamped_images
 from steadypose.prior.arrays import Floats
 
 FPS = 15
-"""Frames in a second of what is written, at most."""
+"""Largest frame rate of the written video, Hz."""
 WIDTH = 480
-"""Width of one of its images in pixels, at most."""
+"""Largest width of one of its panels, pixels."""
 APART_NS = 34_000_000
-"""Time in nanoseconds between an image and the pose that is drawn over it, at most: a step of the prior's grid."""
+"""Largest time between an image and the pose drawn over it, nanoseconds; one frame of the prior's grid."""
 NEAREST = 0.1
-"""Depth in metres from which on a joint is drawn: nearer, it is far beside the image."""
+"""Smallest depth at which a joint is drawn, metres. A nearer joint projects far outside the image."""
 
 
 class Body(NamedTuple):
-    """One body at one moment, in the camera's optical frame."""
+    """One body at one time, in the camera's optical frame."""
 
     raw: Floats | None
-    """(22, 3) metres, what went in; None where it was not kept"""
+    """(22, 3) metres, the input joints; None if they were not stored"""
     clean: Floats
     """(22, 3) metres"""
     observed: NDArray[np.bool_]
@@ -43,12 +43,12 @@ class Body(NamedTuple):
 
 
 def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[NDArray[np.uint8]], float]:
-    """The images (H, W, 3), RGB, of a video that was cleaned, with its skeletons; and how many make a second.
+    """RGB images (H, W, 3) of a cleaned video with its skeletons, and their frame rate in Hz.
 
-    The camera is the one that `steadypose clean VIDEO` took it for, of which the field of view is guessed.
+    The camera model is that of `steadypose clean VIDEO`, with a guessed field of view.
 
     Raises:
-        PlotError: the video cannot be read, or is not the one of which the recording is.
+        PlotError: the video cannot be read, or does not belong to the recording.
     """
     whose = f"expected what 'steadypose clean {video} OUT' makes"
     moments = _of_npz(recording, body) if recording.suffix == ".npz" else _of_recording(recording, body)
@@ -125,7 +125,7 @@ def _frames(
 
 
 def _pixels(joints: Floats, lens: Floats) -> Floats:
-    """(J, 2) where a camera sees joints (J, 3); NaN where they are not before it."""
+    """(J, 2) projection of joints (J, 3) into the image, pixels; NaN for joints that are not in front of the camera."""
     depth = joints[:, 2:]
     return (joints @ lens.T)[:, :2] / np.where(depth > NEAREST, depth, np.nan)
 
@@ -137,7 +137,7 @@ def _with_bones(
     lens: Floats,
     title: str,
 ) -> NDArray[Any]:
-    """An image with the bones of bodies, each of joints and which are observed, and with a title."""
+    """An image with a title, and with the bones of bodies, each given as joints and a mask of observed joints."""
     image = image.copy()
     for joints, observed in bodies:
         pixels = _pixels(joints, lens)

@@ -1,4 +1,4 @@
-"""The panels of the picture: over time, and above and beside these stick figures, trajectory, joints and a summary."""
+"""The panels of a recording's figure: plots over time, stick figures, trajectory, joints, and a summary."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 GAP_S = 0.2
-"""a line is not drawn across a longer gap"""
+"""Longest gap that a plotted line bridges, seconds."""
 JOINTS_SHOWN = 3
 TOPIC_COLOURS = {
     POSE_TRUTH: TRUTH_COLOUR,
@@ -50,7 +50,7 @@ class Panel(NamedTuple):
 
 
 def panels_over_time(history: History, body: int, errors: dict[str, TrackError]) -> list[Panel]:
-    """The panels over time that this recording has something for."""
+    """The panels over time for which the recording has data."""
     raw, clean, world = (history.track(topic, body) for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD))
     panels: list[Panel] = []
     if clean is not None:
@@ -81,7 +81,7 @@ def panels_over_time(history: History, body: int, errors: dict[str, TrackError])
 
 
 def busiest_joints(clean: Track) -> list[int]:
-    """The joints to show: of hands, feet and head those most often missing, then most corrected."""
+    """The joints to show: those of hands, feet and head that are missing most often, then those corrected most."""
     limbs = [J[name] for name in ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")]
     missing = (clean.state == JointState.IMPUTED).mean(axis=0).round(2)
     correction = np.nan_to_num(nan_mean(corrections(clean), axis=0))
@@ -89,12 +89,12 @@ def busiest_joints(clean: Track) -> list[int]:
 
 
 def corrections(clean: Track) -> NDArray[np.float64]:
-    """(T, 22) metres between input and output; NaN where there was no input."""
+    """(T, 22) distances between input and output, metres; NaN where there was no input."""
     return np.linalg.norm(clean.positions - clean.raw, axis=2)
 
 
 def with_gaps(time: NDArray[np.float64], *columns: NDArray) -> list[NDArray]:
-    """Time and columns with a NaN wherever nothing came for a while, so that no line bridges it."""
+    """Time and columns with a NaN inserted in each longer gap, so that no line bridges it."""
     gaps = np.flatnonzero(np.diff(time) > GAP_S) + 1
     return [
         np.insert(time, gaps, np.nan),
@@ -133,8 +133,7 @@ def _draw_observed(ax: Axes, raw: Track, observable: NDArray[np.bool_]) -> None:
 
 
 def _draw_cells(ax: Axes, time: NDArray[np.float64], cells: NDArray[np.uint8], colours: dict[str, str]) -> None:
-    """A row for each column of ``cells`` (T, N), of the colour that is its value's place in ``colours``; white where
-    nothing came."""
+    """Draw ``cells`` (T, N) as N rows, coloured by their values as indices into ``colours``; white in gaps."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
@@ -204,13 +203,13 @@ def _draw_intervals(ax: Axes, history: History) -> None:
 
 
 LATE_RATIO = 1.5
-"""times the usual interval from which on a frame counts as late"""
+"""Interval between frames, relative to the median, above which a frame counts as late, ratio."""
 FIGURES = 12
 CONTACT_PROBABILITY = 0.5
 
 
 def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
-    """Stick figures at even times, seen from the front: what came in behind what came out."""
+    """Draw stick figures at regular times, seen from the front, with the input behind the output."""
     clean = history.track(POSE_CLEAN, body)
     track = next(
         t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if (t := history.track(topic, body)) is not None
@@ -230,16 +229,16 @@ def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
 
 
 def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> list[Floats]:
-    """Where N figures lie in a picture on which they stand in a row, seen from the front; writes the second of each.
+    """Arrange N figures in a row, seen from the front, and label each with its time.
 
     Args:
-        ax: of the picture.
-        seconds: (N,) of each figure.
+        ax: the axes to draw in.
+        seconds: (N,) time of each figure, seconds.
         joints: (N, 22, 3) metres, world.
-        others: the same figures otherwise, drawn in the same place.
+        others: further joints (N, 22, 3) of the same figures, arranged at the same places.
 
     Returns:
-        (N, 22, 2) of ``joints`` and of each of ``others``.
+        (N, 22, 2) coordinates in the axes for ``joints`` and for each of ``others``.
     """
     front = next((f for points in joints if (f := facing(points)) is not None), np.array([1.0, 0.0, 0.0]))
     across = np.array([-front[1], front[0], 0.0])
@@ -258,7 +257,10 @@ def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> 
 def draw_bones(
     ax: Axes, points: Floats, pairs: NDArray[np.intp], colours: str | list[str], *, width: float, alpha: Any = 1.0
 ) -> None:
-    """Draw the bones ``pairs`` (B, 2) whose ends of points (J, 2) are known; colours, and alpha, may be of each."""
+    """Draw the bones ``pairs`` (B, 2) whose ends among points (J, 2) are finite.
+
+    ``colours`` and ``alpha`` are single values, or one per bone.
+    """
     from matplotlib.collections import LineCollection
 
     lines = points[pairs]
@@ -271,7 +273,7 @@ def draw_bones(
 
 
 def draw_path(ax: Axes, history: History, body: int) -> None:
-    """The way over the floor from above, feet where they stood."""
+    """Draw the paths over the floor from above, with the places where feet stood."""
     ax.set_title("from above, m", loc="left", fontsize=10, weight="bold")
     topic = next(t for t in (POSE_WORLD, POSE_CLEAN, POSE_RAW, POSE_TRUTH) if t in history.tracks)
     for person in history.tracks.get(POSE_TRUTH, {}).values():
@@ -300,7 +302,7 @@ def draw_path(ax: Axes, history: History, body: int) -> None:
 
 
 def draw_by_joint(ax: Axes, clean: Track | None, errors: dict[str, TrackError]) -> None:
-    """Each joint's mean distance from the truth or, where that is unknown, from what the sensor said."""
+    """Draw each joint's mean distance from the ground truth or, without ground truth, its mean correction."""
     if errors:
         title = "by joint: mean distance from the truth, cm"
         bars = {topic.removeprefix("pose/"): (error.by_joint, TOPIC_COLOURS[topic]) for topic, error in errors.items()}

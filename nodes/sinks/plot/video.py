@@ -1,6 +1,6 @@
-"""``steadypose plot --video``: a body as the sensor gave it, cleaned, and in the world, side by side and moving.
+"""``steadypose plot --video``: a video of a body side by side as raw, clean and world poses.
 
-Left and right have colours of their own, and what was not observed at the moment is drawn faintly.
+Left and right have different colours. Joints that are not observed in a frame are drawn faintly.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ if TYPE_CHECKING:
 
 VIDEOS = (".gif", ".mp4")
 FPS = 15
-"""of the video: half of the poses', which is smooth enough"""
+"""Frame rate of the video, Hz. Half of the poses' rate is smooth enough."""
 PANEL_INCHES, STAGE_WIDTH, DPI = (2.3, 3.4), 1.6, 80
-"""of a panel; how much wider that of the world is"""
+"""Size of a panel in inches; relative width of the world's panel; resolution in dots per inch."""
 GHOST, FLOOR = "#cfcfcf", "#e6e6e6"
 SIDE_COLOURS = (LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR)
 ELEVATION = 0.22
-"""radians that the view looks down"""
+"""Angle by which the view looks down, radians."""
 TURNED = 0.5
-"""radians that the view is turned from the front"""
+"""Angle by which the view is rotated from the front, radians."""
 TALL = 1.8
-"""metres of room above the floor"""
+"""Height of the space shown above the floor, metres."""
 PATH_FRAMES = 150
-"""of the way over the floor that are shown"""
+"""Length of the drawn path over the floor, frames."""
 SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
-"""of each colour on white, which a GIF has: few, and the same in all frames, or colours flicker"""
+"""Opacities on white of each colour in a GIF's palette. They are few, and the same in all frames, to avoid flicker."""
 
 
 def write_overlay(recording: Path, video: Path, path: Path, body: int | None = None) -> int:
-    """Write what was cleaned of a video over its images, as the ending says; returns the number of frames.
+    """Write a video's cleaned skeletons over its images, in the format of the suffix. Returns the number of frames.
 
     Raises:
-        PlotError: OpenCV is not installed, or as `overlay.overlaid`.
+        PlotError: OpenCV is not installed, or as in `overlay.overlaid`.
     """
     try:
         from steadypose.nodes.sinks.plot.overlay import overlaid
@@ -68,7 +68,7 @@ def write_overlay(recording: Path, video: Path, path: Path, body: int | None = N
 
 
 def write_video(history: History, path: Path, body: int | None = None) -> int:
-    """Write the video of one body, as the ending says, at about `FPS`; returns the number of frames.
+    """Write the video of one body at about `FPS`, in the format of the suffix. Returns the number of frames.
 
     Raises:
         PlotError: there is nothing to draw, no such body, or OpenCV is not installed, for an .mp4.
@@ -85,10 +85,10 @@ def write_video(history: History, path: Path, body: int | None = None) -> int:
 
 
 class View:
-    """An orthographic projection: right and up in the picture, of points in the world.
+    """An orthographic projection of the world's points to the image's right and up.
 
     Args:
-        front: (3,) unit vector, horizontal, that faces the viewer but for a small turn.
+        front: (3,) horizontal unit vector that faces the viewer, except for a rotation by `TURNED`.
     """
 
     def __init__(self, front: Floats) -> None:
@@ -103,7 +103,7 @@ class View:
 
 
 def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDArray[np.uint8]]:
-    """(H, W, 3) pictures, RGB, of every so many rows of the track that leads."""
+    """RGB images (H, W, 3) of every ``step``-th row of the leading track."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -150,7 +150,7 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
 
 
 def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Callable[[Axes, int], None]:
-    """Draws with the body in the middle of the panel, which it fills."""
+    """A function that draws a panel filled by the body, which stays in its middle."""
     middle = _smooth(np.nanmean(np.where(np.isfinite(track.positions), track.positions, np.nan), axis=1))
     low, high = np.nanpercentile(track.positions[..., 2], (1, 99)) if len(track.time) else (0.0, 1.8)
     middle[:, 2] = (low + high) / 2
@@ -167,7 +167,7 @@ def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Ca
 
 
 def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, int], None]:
-    """Draws the body where it is on the floor, with the way that it came."""
+    """A function that draws the body at its position on the floor, with its path."""
     floor = float(np.nanpercentile(world.positions[..., 2].min(axis=1), 5))
     root = world.positions[:, 0] * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]
     low, high = np.nanmin(root[:, :2], axis=0) - 0.4, np.nanmax(root[:, :2], axis=0) + 0.4
@@ -195,7 +195,7 @@ def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, in
 
 
 def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
-    """What went in, over what came out of it."""
+    """Draw the input over the output."""
     draw_bones(ax, view(clean.positions[row]), ALL_BONES, GHOST, width=2.0)
     draw_bones(ax, view(clean.raw[row]), shown, _sides(shown), width=3.0)
 
@@ -213,7 +213,7 @@ def _sides(shown: NDArray[np.intp]) -> list[str]:
 
 
 def _smooth(path: Floats, frames: int = 15) -> Floats:
-    """(T, 3), gaps filled, averaged over so many frames, so that a view that follows it does not shake."""
+    """(T, 3) path with gaps filled, averaged over ``frames``, so that a view that follows it does not shake."""
     rows = np.arange(len(path))
     filled = np.zeros_like(path)
     for axis in range(path.shape[1]):
@@ -224,7 +224,7 @@ def _smooth(path: Floats, frames: int = 15) -> Floats:
 
 
 def _palette() -> list[int]:
-    """Red, green and blue, 0 to 255, of each colour in turn."""
+    """A palette as a list of red, green and blue, 0 to 255, of each colour in turn."""
     from matplotlib.colors import to_rgb
 
     colours = [np.array(to_rgb(name)) for name in (*SIDE_COLOURS, CONTACT_COLOUR, "black")]
@@ -233,8 +233,13 @@ def _palette() -> list[int]:
 
 
 def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float, *, shades: bool = True) -> int:
-    """Args:
-    shades: whether the colours are those of `SHADES`; if not, each image has its own.
+    """Write a GIF. Returns the number of frames.
+
+    Args:
+        frames: RGB images (H, W, 3).
+        path: path of the file.
+        fps: frame rate, Hz.
+        shades: whether to use the palette of `SHADES`; otherwise each image has its own palette.
     """
     from PIL import Image
 
@@ -260,7 +265,7 @@ def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> i
     for frame in frames:
         picture = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2, ::-1]
         if writer is None:
-            codec = cv2.VideoWriter.fourcc(*"vp09")  # plays in browsers; H.264 is in no OpenCV that is installed by pip
+            codec = cv2.VideoWriter.fourcc(*"vp09")  # plays in browsers; pip's OpenCV has no H.264
             writer = cv2.VideoWriter(str(path), codec, fps, picture.shape[1::-1])
             if not writer.isOpened():
                 raise PlotError(f"{path}: this OpenCV cannot write VP9; write a .gif")

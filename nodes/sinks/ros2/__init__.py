@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from steadypose.nodes.settings import LaunchError, check_host_and_port
 
 HOST = "127.0.0.1"
-"""this machine only, as poses are personal data: from another machine, use ssh -L 8765:localhost:8765 robot"""
+"""Address to serve at: this machine only, because poses are personal data. From another machine, use
+``ssh -L 8765:localhost:8765 robot``."""
 _NAMESPACE = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
 
@@ -17,13 +18,13 @@ class Ros2BridgeSettings:
     """``[ros2]``: poses in ROS 2."""
 
     world_frame: str = "world"
-    """what the frame of pose/world is called in TF: map, odom, base_link, or a frame of its own"""
+    """TF frame of pose/world: map, odom, base_link, or a separate frame"""
     sensor_tf: bool = True
-    """publish where a calibrated sensor stands; off where the robot's own description does"""
+    """whether to publish the pose of a calibrated sensor; false if the robot's description does"""
     clock: bool = True
-    """publish /clock while a recording is replayed, for nodes with use_sim_time"""
+    """whether to publish /clock during a replay, for nodes with use_sim_time"""
     namespace: str = ""
-    """of the node and its topics, but for /tf, /tf_static, /clock and /diagnostics, which all robots share"""
+    """namespace of the node and its topics, except /tf, /tf_static, /clock and /diagnostics, which all robots share"""
 
     def __post_init__(self) -> None:
         if not self.world_frame or self.world_frame.startswith("/"):
@@ -39,9 +40,9 @@ class FoxgloveSettings:
     """``[foxglove]``: poses for Foxglove."""
 
     port: int = 8765
-    """of the WebSocket: open ws://localhost:8765 in Foxglove"""
+    """port of the WebSocket: open ws://localhost:8765 in Foxglove"""
     world_frame: str = "world"
-    """what the frame of pose/world is called"""
+    """name of the frame of pose/world"""
 
     def __post_init__(self) -> None:
         check_host_and_port("foxglove", HOST, self.port, least=0)

@@ -1,10 +1,10 @@
-"""Poses and ``diagnostics`` as ROS 2 messages: to ROS 2, or without it to Foxglove over its WebSocket.
+"""Publishes poses and ``diagnostics`` as ROS 2 messages: in ROS 2, or to Foxglove over its WebSocket without ROS.
 
 docs/ros2.md lists the topics.
 """
 
 # pyright: reportMissingImports=false
-# an optional extra, which need not be installed
+# an optional extra that may not be installed
 
 from __future__ import annotations
 
@@ -26,25 +26,27 @@ if TYPE_CHECKING:
 
 RVIZ, LAYOUT = PACKAGE / "launch/views/steadypose.rviz", PACKAGE / "launch/views/foxglove.json"
 GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
-"""topics that are in no namespace, by ROS's convention"""
+"""Topics outside any namespace, by ROS's convention."""
 
 
 def check_ros2(launch: Launch) -> None:
-    """Raises:
-    LaunchError: nothing that speaks ROS 2 is installed.
+    """Check that ROS 2's topics can be reached.
+
+    Raises:
+        LaunchError: there is neither a sourced ROS 2 nor Cyclone DDS.
     """
     check_ros()
 
 
 class RosOutput:
-    """Publishes each topic from its first message on, in a namespace."""
+    """Publishes to ROS 2 in a namespace. A topic is advertised with its first message."""
 
     def __init__(self, connection: Connection, namespace: str = "") -> None:
         self._connection = connection
         self._prefix = f"{namespace}/" if namespace else ""
         self._publish: dict[str, Publish] = {}
         self.missing: dict[str, str] = {}
-        """topics whose types are not to be had, and what to do about it"""
+        """topics whose types are not available, and what to do about it"""
 
     def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None:
         if topic in self.missing:
@@ -64,9 +66,9 @@ class RosOutput:
 
 
 class FoxgloveOutput:
-    """A WebSocket server with a channel for each topic, from its first message on.
+    """A WebSocket server with a channel per topic, created with the topic's first message.
 
-    The server keeps no message: what is latched is sent again when somebody subscribes, to all who have.
+    The server itself keeps no messages. A latched message is sent again to all subscribers when a client subscribes.
     """
 
     def __init__(self, port: int) -> None:
@@ -107,7 +109,7 @@ class FoxgloveOutput:
         self._channels[topic].log(cdr)
 
     def repeat(self, channel: str) -> None:
-        """Send the latched message of a channel again, if there is one."""
+        """Send a channel's latched message again, if there is one."""
         topic = channel.removeprefix("/")
         open_one, cdr = self._channels.get(topic), self._latched.get(topic)
         if open_one and cdr is not None:
@@ -123,7 +125,7 @@ class FoxgloveOutput:
 
 
 class RosMessagesNode(Node):
-    """Publishes what steadypose says as ROS messages, by the `BodyTopics` of its output."""
+    """Publishes steadypose's messages as ROS messages, by the `BodyTopics` of its output."""
 
     _topics: BodyTopics
 
@@ -145,7 +147,7 @@ class Ros2BridgeNode(RosMessagesNode):
         self._output: RosOutput | None = None
 
     def work(self) -> None:
-        from steadypose.nodes.sinks.ros2.messages import BodyTopics  # here and below: not to read a launch file
+        from steadypose.nodes.sinks.ros2.messages import BodyTopics  # not needed to read a launch file; so below
 
         connection = connect("steadypose_bridge", self._settings.namespace)
         try:
@@ -172,7 +174,7 @@ class Ros2BridgeNode(RosMessagesNode):
 
 
 class FoxgloveNode(RosMessagesNode):
-    """Serves poses to Foxglove, newest first when it falls behind; the pipeline never waits for it."""
+    """Serves poses to Foxglove. When it falls behind it skips frames; the pipeline never waits for it."""
 
     name = "foxglove"
     url = ""

@@ -1,4 +1,4 @@
-"""``pose/world`` and ``diagnostics`` as ROS 2 messages of standard types, and the topics that they go to."""
+"""Converts ``pose/world`` and ``diagnostics`` to ROS 2 messages of standard types, and assigns their topics."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 
 MARKER_LIFE_S = 0.5
 JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
-"""metres"""
+"""Sizes of markers, metres."""
 SPHERE_LIST, LINE_LIST, TEXT_VIEW_FACING, ARROW = 7, 5, 9, 0
-"""of ``visualization_msgs/Marker``"""
+"""Marker types of ``visualization_msgs/Marker``."""
 UNKNOWN_VARIANCE = 1e6
-"""variance of components of an odometry that are not measured, in m², rad² etc."""
+"""Variance of unobserved components of an odometry, m², rad², m²/s² or rad²/s²."""
 
 
 def _colour(r: float, g: float, b: float, a: float = 1.0) -> Any:
@@ -58,13 +58,13 @@ def is_finite(body: WorldBody) -> bool:
 
 
 def pose_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
-    """``geometry_msgs/PoseArray``: the 22 joints of one body after the other."""
+    """``geometry_msgs/PoseArray`` with the 22 joints of one body after another."""
     poses = [pose for body in bodies.values() for pose in _joint_poses(body)]
     return new("geometry_msgs/msg/PoseArray", header=header(world.stamp_ns, world.frame_id), poses=poses)
 
 
 def marker_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
-    """``visualization_msgs/MarkerArray``: joints by where they come from, bones, velocity and name of each body."""
+    """``visualization_msgs/MarkerArray`` with joints coloured by state, bones, velocity and name of each body."""
     where = header(world.stamp_ns, world.frame_id)
     markers = [mark for name, body in bodies.items() for mark in _marks(where, name, body)]
     return new("visualization_msgs/msg/MarkerArray", markers=markers)
@@ -73,13 +73,13 @@ def marker_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
 def odometry(world: PoseWorld, name: str, body: WorldBody, turn_covariance: np.ndarray) -> Any:
     """``nav_msgs/Odometry`` of a body's root: pose in the world, velocity in its own frame, both with covariance.
 
-    Angular velocities are without an estimate of their own: their variance is `UNKNOWN_VARIANCE`.
+    Angular velocity is not estimated; its variance is `UNKNOWN_VARIANCE`.
 
     Args:
         world: the message.
-        name: of the body.
-        body: one of the message's.
-        turn_covariance: (3, 3) rad², of the root's orientation, about the world's axes.
+        name: name of the body.
+        body: a body of the message.
+        turn_covariance: (3, 3) covariance of the root's orientation about the world's axes, rad².
     """
     turned = Rotation.from_quat(body.root_orientation).as_matrix()
     pose_covariance, twist_covariance = np.eye(6) * UNKNOWN_VARIANCE, np.eye(6) * UNKNOWN_VARIANCE
@@ -107,12 +107,12 @@ def joint_state(world: PoseWorld, name: str, angles: Mapping[str, float]) -> Any
 
 
 def ids_list(world: PoseWorld, names: list[str]) -> Any:
-    """``hri_msgs/IdsList`` of those that are followed."""
+    """``hri_msgs/IdsList`` of the tracked bodies."""
     return new("hri_msgs/msg/IdsList", header=header(world.stamp_ns, world.frame_id), ids=names)
 
 
 def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
-    """The links of one body: the ``body`` in the world, all others in the body, as REP-155 wants them."""
+    """Transforms of one body's links: ``body`` relative to the world, all others relative to ``body`` (REP-155)."""
     root, heading = links["body"]
     origins = np.stack([origin for origin, _ in links.values()])
     turns = np.stack([turn for _, turn in links.values()])
@@ -177,7 +177,7 @@ def _pose(place: np.ndarray, quaternion: np.ndarray) -> Any:
 
 
 def _joint_poses(body: WorldBody) -> Iterator[Any]:
-    """The 22 canonical joints in the world."""
+    """Poses of the 22 canonical joints in the world."""
     turns = Rotation.from_matrix(joint_rotations(body), assume_valid=True).as_quat()
     return (_pose(place, turn) for place, turn in zip(body.positions, turns, strict=True))
 
@@ -219,7 +219,7 @@ def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
 
 
 def names_of(world: PoseWorld) -> tuple[dict[str, WorldBody], int]:
-    """The bodies of a message that can be published, by their names in ROS, and how many are followed and cannot."""
+    """A message's publishable bodies by ROS name, and the number of tracked bodies that are not finite."""
     followed = [body for body in world.bodies if body.tracking != Tracking.LOST]
     found = {body_name(body.id): body for body in followed if is_finite(body)}
     return found, len(followed) - len(found)
@@ -227,7 +227,7 @@ def names_of(world: PoseWorld) -> tuple[dict[str, WorldBody], int]:
 
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
 GROWN = 0.02
-"""metres: where a link has become so much longer or shorter, the body's URDF is published again"""
+"""Change of a link's length at which the body's URDF is published again, metres."""
 OF_BODY = {
     "joint_states": "sensor_msgs/msg/JointState",
     "odom": "nav_msgs/msg/Odometry",
@@ -236,7 +236,7 @@ OF_BODY = {
 
 
 class Output(Protocol):
-    """Where serialised messages go."""
+    """The receiver of serialised messages."""
 
     def send(self, topic: str, kind: str, cdr: bytes, *, latched: bool = False) -> None: ...
 
@@ -244,11 +244,11 @@ class Output(Protocol):
 
 
 class BodyTopics:
-    """Sends what steadypose says as ROS
+    """Sends steadypose's messages to ROS topics.
 
     Args:
-        output: where to.
-        settings: of the bridge.
+        output: receiver of the serialised messages.
+        settings: the bridge's settings.
     """
 
     def __init__(self, output: Output, settings: Ros2BridgeSettings) -> None:
@@ -259,7 +259,7 @@ class BodyTopics:
         self._moving: set[str] = set()
 
     def send(self, message: Message) -> int:
-        """Send a message; returns how many of its bodies could not be, for want of a finite pose."""
+        """Send a message. Returns the number of its bodies that were not sent because their pose is not finite."""
         if isinstance(message, Diagnostics):
             self._send("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", diagnostic_array(message))
         elif isinstance(message, PoseRaw):
@@ -275,7 +275,7 @@ class BodyTopics:
         return 0
 
     def send_clock(self, stamp_ns: int) -> None:
-        """The time of a replay."""
+        """Publish the time of a replay."""
         self._send("clock", "rosgraph_msgs/msg/Clock", clock(max(stamp_ns, 0)))
 
     def _send_world(self, world: PoseWorld) -> int:
@@ -301,7 +301,7 @@ class BodyTopics:
         return refused
 
     def _turn_covariance(self, body: WorldBody) -> np.ndarray:
-        """(3, 3) rad², of the root's orientation."""
+        """(3, 3) covariance of the root's orientation, rad²."""
         positions, sigma = body.positions.astype(np.float64), body.sigma.astype(np.float64)
         return self._root_covariance(positions[None], sigma[None], rotation_matrix(body.root_orientation)[None])[0]
 
@@ -312,8 +312,10 @@ class BodyTopics:
             self._send_of(name, "urdf", new("std_msgs/msg/String", data=urdf(name, measured)), latched=True)
 
     def _send_sensor(self, clean: PoseClean) -> None:
-        """A sensor that stands still goes to /tf_static when it is first heard of, one that moves to /tf with each
-        message. Who listens late gets the last message of /tf_static alone: each has all sensors that stand still."""
+        """Publish a sensor's pose: of a static sensor once on /tf_static, of a moving one on /tf with each message.
+
+        A late subscriber receives only the last message of /tf_static, so each contains all static sensors.
+        """
         frame, pose, world = clean.frame_id, clean.sensor_pose, self._settings.world_frame
         if not self._settings.sensor_tf or not clean.calibrated or frame in ("", world):
             return

@@ -1,12 +1,12 @@
-"""A body as REP-155 describes one: the frames of its links, the angles of its joints, and a URDF that has both.
+"""A body as in REP-155: the frames of its links, the angles of its joints, and a URDF with both.
 
-REP-155 (ROS for human-robot interaction) names 15 links and 20 revolute joints, those of ROS' package
-``human_description``. In its zero configuration the body stands upright and its arms hang; every link's frame then
-has x forward, y left and z up. The canonical skeleton rests in a T instead, so that arms differ by a quarter turn.
+REP-155 (ROS for human-robot interaction) defines 15 links and 20 revolute joints, those of ROS's package
+``human_description``. In its zero configuration the body stands upright with hanging arms, and every link's frame has x
+forward, y left and z up. The canonical skeleton rests in a T pose instead, so the arms' frames differ by 90 degrees.
 
-The frames are exact: each is where the canonical joint is. The joint angles are what that model can say: its torso
-is stiff and bends only forwards, at the pelvis; its elbows and knees are hinges, and its shoulders and hips lie fast in
-torso and body.
+The frames are exact: each lies at its canonical joint. The joint angles are an approximation by REP-155's model, whose
+torso is rigid and bends only forwards, at the pelvis; whose elbows and knees are hinges; and whose shoulders and hips
+are fixed in torso and body.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, J
 
 Links = Mapping[str, tuple[Floats, Floats]]
-"""position (3,) metres and rotation (3, 3) in the world of each link, by name"""
+"""Position (3,) metres and rotation (3, 3) in the world of each link, by name."""
 
 
 class Link(NamedTuple):
-    """A link of REP-155 and what it is in the canonical skeleton.
+    """A link of REP-155 and its counterpart in the canonical skeleton.
 
     Attributes:
-        origin: the joint where it begins.
-        turned_by: the joint whose rotation turns it.
-        rest: (3, 3), its rotation in the T of the canonical skeleton.
+        origin: joint at which it begins.
+        turned_by: joint whose rotation it has.
+        rest: (3, 3) rotation in the T pose of the canonical skeleton.
     """
 
     origin: int
@@ -54,30 +54,30 @@ def _links() -> dict[str, Link]:
         for part in ("shoulder", "elbow", "wrist"):
             joint = J[f"{side}_{part}"]
             links[f"{side[0]}_{part}"] = Link(joint, joint, raised)
-        for part in ("hip", "knee", "ankle", "foot"):  # feet are ours: REP-155 ends at the ankles
+        for part in ("hip", "knee", "ankle", "foot"):  # feet are an addition: REP-155 ends at the ankles
             joint = J[f"{side}_{part}"]
             links[f"{side[0]}_{part}"] = Link(joint, joint, along)
     return links
 
 
 LINKS: Mapping[str, Link] = _links()
-"""by name, without the body's id; ``body`` is the root"""
+"""Links by name, without the body's id; ``body`` is the root."""
 
 JOINTS: tuple[str, ...] = (
     "waist", "r_head", "y_head", "p_head",
     *(f"{side}_{joint}" for side in "lr" for joint in ("y_shoulder", "p_shoulder", "r_shoulder", "elbow")),
     *(f"{side}_{joint}" for side in "lr" for joint in ("y_hip", "p_hip", "r_hip", "knee")),
 )  # fmt: skip
-"""the joints that move, without the body's id"""
+"""Names of the moving joints, without the body's id."""
 
 
 def body_name(body_id: int) -> str:
-    """A body's id as ROS takes it in names of topics and frames, where no part may begin with a digit."""
+    """A body's id for ROS's names of topics and frames, whose parts must not begin with a digit."""
     return f"b{body_id & 0xFFFFFFFF:x}"
 
 
 def joint_rotations(body: WorldBody) -> Floats:
-    """(22, 3, 3) of the canonical joints in the world."""
+    """(22, 3, 3) rotations of the canonical joints in the world."""
     turned = Rotation.from_quat(body.rotations.astype(np.float64)).as_matrix()
     for joint, parent in enumerate(PARENTS):
         if parent >= 0:
@@ -86,13 +86,13 @@ def joint_rotations(body: WorldBody) -> Floats:
 
 
 def frames(body: WorldBody) -> Links:
-    """Where every link of a body is."""
+    """Position and rotation of every link of a body, world."""
     positions, turned = body.positions.astype(np.float64), joint_rotations(body)
     return {name: (positions[link.origin], turned[link.turned_by] @ link.rest) for name, link in LINKS.items()}
 
 
 def joint_angles(links: Links) -> dict[str, float]:
-    """Radians of every joint of `JOINTS`, from the links' `frames`."""
+    """Angle of every joint of `JOINTS`, radians, from the links' `frames`."""
 
     def between(parent: str, child: str) -> Floats:
         return links[parent][1].T @ links[child][1]
@@ -114,24 +114,24 @@ def joint_angles(links: Links) -> dict[str, float]:
 
 
 def _about_y(turn: Floats) -> float:
-    """The angle about y that comes nearest to a rotation."""
+    """Angle about y of the nearest rotation about y, radians."""
     return float(np.arctan2(turn[0, 2] - turn[2, 0], turn[0, 0] + turn[2, 2]))
 
 
 def _xzy(turn: Floats) -> tuple[float, float, float]:
-    """a, b, c of Rx(a) Rz(b) Ry(c)."""
+    """Angles a, b, c of Rx(a) Rz(b) Ry(c), radians."""
     b = np.arcsin(np.clip(-turn[0, 1], -1.0, 1.0))
     return float(np.arctan2(turn[2, 1], turn[1, 1])), float(b), float(np.arctan2(turn[0, 2], turn[0, 0]))
 
 
 def _zxy(turn: Floats) -> tuple[float, float, float]:
-    """a, b, c of Rz(a) Rx(b) Ry(c)."""
+    """Angles a, b, c of Rz(a) Rx(b) Ry(c), radians."""
     b = np.arcsin(np.clip(turn[2, 1], -1.0, 1.0))
     return float(np.arctan2(-turn[0, 1], turn[1, 1])), float(b), float(np.arctan2(-turn[2, 0], turn[2, 2]))
 
 
 def _zxz(turn: Floats, sign: float) -> tuple[float, float, float]:
-    """a, b, c of Rz(a) Rx(b) Rz(c), with b of that sign; an arm that hangs straight has a = 0."""
+    """Angles a, b, c of Rz(a) Rx(b) Rz(c), radians, with b of the given sign. For a hanging arm (b = 0), a is 0."""
     sine = sign * np.hypot(turn[0, 2], turn[1, 2])
     b = np.arctan2(sine, turn[2, 2])
     if abs(sine) < 1e-6:
@@ -141,9 +141,9 @@ def _zxz(turn: Floats, sign: float) -> tuple[float, float, float]:
 
 
 def measures(body: WorldBody) -> dict[str, Floats]:
-    """(3,) metres, where each link of the URDF begins in the frame of the one it hangs from, in the zero pose.
+    """(3,) metres, origin of each URDF link in its parent's frame, in the zero configuration.
 
-    The person's, whatever the pose: of the body at rest, with no joint turned.
+    They are the person's measures, independent of the pose: those of the body at rest.
     """
     positions, turned = body.positions.astype(np.float64), joint_rotations(body)
     rest = np.zeros_like(positions)
@@ -174,13 +174,13 @@ def urdf(body: str, measured: Mapping[str, Floats]) -> str:
     """The URDF of one person.
 
     Args:
-        body: the body's id, which ends the names of links and joints.
-        measured: this person's `measures`.
+        body: the body's id, the suffix of all names of links and joints.
+        measured: the person's `measures`.
     """
     robot = ElementTree.Element("robot", name=f"human_{body}")
 
     def add(link: str, parent: str, joint: str, axis: tuple[float, float, float] | None, origin: Floats) -> None:
-        """A link, and the joint by which it hangs from its parent: a hinge, or fast if there is no axis."""
+        """Add a link and the joint to its parent: a hinge about ``axis``, or a fixed joint if that is None."""
         shape = ElementTree.SubElement(robot, "link", name=f"{link}_{body}")
         kind = "fixed" if axis is None else "revolute"
         hinge = ElementTree.SubElement(robot, "joint", name=f"{joint}_{body}", type=kind)
@@ -221,17 +221,17 @@ _BONES: Mapping[str, tuple[str, ...]] = {
     "l_shoulder": ("*_elbow",), "r_shoulder": ("*_elbow",), "l_elbow": ("*_wrist",), "r_elbow": ("*_wrist",),
     "l_hip": ("*_knee",), "r_hip": ("*_knee",), "l_knee": ("*_ankle",), "r_knee": ("*_ankle",),
 }  # fmt: skip
-"""what is drawn of each link: from its origin to where these begin"""
+"""Links to whose origins a cylinder is drawn from each link's origin; ``*`` is the side."""
 BONE_RADIUS = 0.03
-"""metres"""
+"""Radius of a drawn bone, metres."""
 
 
 def _draw(link: ElementTree.Element, end: Floats) -> None:
-    """A cylinder from the link's origin to ``end`` (3,) in its frame."""
+    """Add a cylinder from the link's origin to ``end`` (3,) metres in its frame."""
     length = float(np.linalg.norm(end))
     visual = ElementTree.SubElement(link, "visual")
     x, y, z = end / max(length, 1e-9)
-    # URDF's cylinder lies along z: turn that about y, then about z
+    # URDF's cylinder lies along z: rotate it about y, then about z
     ElementTree.SubElement(visual, "origin", xyz=_numbers(end / 2), rpy=_numbers((0.0, np.arccos(z), np.arctan2(y, x))))
     geometry = ElementTree.SubElement(visual, "geometry")
     ElementTree.SubElement(geometry, "cylinder", length=f"{length:.4f}", radius=f"{BONE_RADIUS}")

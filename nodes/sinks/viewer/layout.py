@@ -1,4 +1,4 @@
-"""The viewer's window: scenes, plots, their colours, and where the scenes are looked at from."""
+"""Layout of the viewer's window: scenes, plots, their colours, and the initial viewpoint."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def _rgb(colour: str) -> list[int]:
 
 DARK_RGB = _rgb(DARK)
 SIDE_RGB = np.array([_rgb(colour) for colour in ON_DARK], np.uint8)
-"""(3, 3) of left, right and middle"""
+"""(3, 3) colours of left, right and middle."""
 FAINT_RGB = (FAINT * SIDE_RGB + (1.0 - FAINT) * np.array(DARK_RGB)).astype(np.uint8)
-"""the same of what was not observed, for lines here have no opacity"""
+"""(3, 3) colours of unobserved joints and bones, blended with the background because Rerun's lines have no opacity."""
 STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.uint8)
 RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(_rgb, (RAW_COLOUR, TRUTH_COLOUR, CONTACT_COLOUR, ALARM_COLOUR))
 PATH_RGB = [235, 235, 235]
@@ -53,16 +53,16 @@ LEGEND = """
 
 
 class Eye(NamedTuple):
-    """Where a scene is looked at from, at first."""
+    """The initial viewpoint of a scene."""
 
     target: NDArray[np.float64]
-    """(3,) metres, world: the middle of those seen"""
+    """(3,) metres, world: the middle of the bodies"""
     front: NDArray[np.float64]
-    """(3,) unit vector, world: where one of them faces"""
+    """(3,) unit vector, world: direction in which one of them faces"""
 
 
 def name_series(recording: rr.RecordingStream) -> None:
-    """Give the plots' lines their names and colours once, for good."""
+    """Log the names and colours of the plots' lines, which are static."""
     import rerun as rr
 
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -82,13 +82,13 @@ def name_series(recording: rr.RecordingStream) -> None:
 
 
 def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool = False) -> rrb.Blueprint:
-    """How scenes and plots lie in the window.
+    """The layout of scenes and plots in the window.
 
     Args:
-        eye: where the scenes are looked at from; None until somebody was seen.
-        calibrated: whether the floor's place is known, and drawn under raw and clean.
-        scored: whether the prior scores its windows, and there is an anomaly to plot.
-        images: whether there are images of the camera, to draw the clean poses over.
+        eye: the initial viewpoint; None until a body was observed.
+        calibrated: whether the floor's height is known, and the floor is drawn in raw and clean.
+        scored: whether the prior gives anomaly scores to plot.
+        images: whether there are camera images to draw the clean poses over.
     """
     import rerun.blueprint as rrb
 

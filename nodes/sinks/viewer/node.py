@@ -1,8 +1,8 @@
 """The viewer: raw and clean poses side by side in a browser, through Rerun.
 
-It only subscribes, so the pipeline does not know of it: start it, stop it, look or do not look, the poses are the
-same. `PoseView` turns messages into drawings and knows neither sockets nor nodes; `ViewerServer` is the process that
-keeps the last minutes of drawings and serves them with the page. Both need the optional extra ``view``.
+It only subscribes, so it does not affect the poses. `PoseView` turns messages into drawings, and knows neither sockets
+nor nodes. `ViewerServer` keeps the last minutes of drawings and serves them with the page. Both need the optional extra
+``view``.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewerSettings:
-    """``[viewer]``: the picture in the browser."""
+    """``[viewer]``: the live view in the browser."""
 
     host: str = "127.0.0.1"
-    """address to serve at. Any other than this machine's own shows people in a room to whoever listens on the network:
-    ``ssh -L 9090:localhost:9090 robot`` carries the picture safely"""
+    """address to serve at. At an address of the network, anyone who listens there can see the people;
+    ``ssh -L 9090:localhost:9090 robot`` is the safe way from another machine"""
     port: int = 9090
-    """of the web page and the drawings"""
+    """port of the web page and the drawings"""
 
     def __post_init__(self) -> None:
         check_host_and_port("viewer", self.host, self.port)
 
 
 class ViewerNode(Node):
-    """Draws what the other nodes publish, newest first when it falls behind; the pipeline never waits for it."""
+    """Draws the other nodes' messages. When it falls behind it skips frames; the pipeline never waits for it."""
 
     name = "viewer"
 
     def run(self) -> None:
-        # not for those who only read a launch file
+        # imported late, because launch files import this module
         from steadypose.nodes.sinks.viewer.scene import PoseView
         from steadypose.nodes.sinks.viewer.server import ViewerServer
         from steadypose.nodes.sources.image import NAME, ImageReader
@@ -77,16 +77,16 @@ class ViewerNode(Node):
         self._view.log(topic, message)
 
     def status(self) -> dict[str, str]:
-        return {"address": self._server.url.partition("?")[0]}  # without the token, for diagnostics are recorded
+        return {"address": self._server.url.partition("?")[0]}  # without the token, because diagnostics are recorded
 
 
 def flagged_from(launch: Launch) -> float:
-    """The anomaly from which on the prior raises its flag."""
+    """The anomaly score above which the prior raises its flag."""
     return -math.log10(PriorSettings.from_dict(launch.table("prior")).score.false_alarms)
 
 
 def connect(server: ViewerServer) -> rr.RecordingStream:
-    """A stream of drawings to the server."""
+    """Create a stream of drawings to the server."""
     import rerun as rr
 
     from steadypose.nodes.sinks.viewer.server import FLUSH_S

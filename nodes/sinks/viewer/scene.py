@@ -1,4 +1,4 @@
-"""What the viewer draws of each message: bodies in three scenes, and the lines of its plots."""
+"""Draws each message in the viewer: bodies in three scenes, and the lines of the plots."""
 
 from __future__ import annotations
 
@@ -46,19 +46,20 @@ if TYPE_CHECKING:
     from steadypose.nodes.sources.image import CameraImage
 
 PATH_SECONDS = 10.0
-"""of a body's path over the floor that are drawn"""
+"""Length of the drawn path of a body over the floor, seconds."""
 CONTACT_PROBABILITY = 0.5
+"""Contact probability above which a contact is drawn."""
 FOLLOW_SHARE = 0.1
-"""gain by which the eye follows the bodies with each message: low enough not to shake with a raw pose"""
+"""Gain per message with which the viewpoint follows the bodies. It is low, so that raw poses do not shake the view."""
 FOLLOW_STEP = 0.1
-"""metres a message that the eye moves at most, whatever a joint does"""
+"""Largest step of the viewpoint per message along an axis, metres."""
 BELOW_TRUNK = 0.25
-"""metres from the middle of the trunk down to the middle of a standing body"""
+"""Distance from the middle of the trunk down to the middle of a standing body, metres."""
 BACK_JUMP_NS = 1_000_000_000
-"""a stamp so far behind the last one is a stream that starts again"""
+"""Backward step of stamps beyond which a stream counts as restarted, nanoseconds."""
 
 MOST_IMAGES = 30
-"""that wait for the poses of their moment: two seconds"""
+"""Largest number of images that wait for their poses; two seconds of images."""
 
 OBSERVED = (JointState.SEEN, JointState.REFINED)
 
@@ -66,19 +67,19 @@ _TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
 
 class PoseView:
-    """Draws messages: three scenes (raw, clean, world), and as plots corrections, joint states, rates and, where the
-    prior scores its windows, anomaly.
+    """Draws messages in three scenes (raw, clean, world), and plots corrections, joint states, rates and, if the prior
+    gives them, anomaly scores.
 
-    Everything is drawn in the z-up world, raw and clean by way of the message's sensor pose, at the time of capture
-    counted from the first message.
+    Everything is drawn in the z-up world; raw and clean are transformed by the message's sensor pose. Time is capture
+    time since the first message.
     """
 
     def __init__(self, recording: rr.RecordingStream, threshold: float = math.nan) -> None:
         """Draw into a recording.
 
         Args:
-            recording: to draw into.
-            threshold: the anomaly from which on the prior raises its flag; drawn beside the score.
+            recording: Rerun's stream of drawings.
+            threshold: anomaly score above which the prior raises its flag; drawn beside the score.
         """
         self._recording, self._threshold = recording, threshold
         self._origin_ns: int | None = None
@@ -98,8 +99,8 @@ class PoseView:
         """Draw one message.
 
         Raises:
-            ValueError: the message cannot be drawn: an unknown skeleton, a wrong number of joints, a sensor pose
-                that is no rotation.
+            ValueError: the message cannot be drawn: its skeleton is unknown, its number of joints is wrong, or its
+                sensor pose is invalid.
         """
         if isinstance(message, Diagnostics):
             self._draw_rates(message)
@@ -119,11 +120,11 @@ class PoseView:
             self._follow(topic, list(drawn.values()), calibrated=getattr(message, "calibrated", True))
 
     def keep(self, image: CameraImage) -> None:
-        """Draw an image of the camera once the clean poses of its moment have come."""
+        """Keep a camera image, which is drawn when the clean poses of its time arrive."""
         self._images.append(image)
 
     def _draw_image(self, message: PoseClean) -> None:
-        """The newest image that is not ahead of the poses, where its camera stands: the poses lie over it."""
+        """Draw the latest image not newer than the poses, at its camera's pose, so that the poses overlay it."""
         import rerun as rr
 
         newest: CameraImage | None = None
@@ -143,7 +144,7 @@ class PoseView:
         self._log("camera/image", rr.EncodedImage(contents=newest.jpeg, media_type="image/jpeg"))
 
     def _draw_rates(self, message: Diagnostics) -> None:
-        """The nodes' own counts, drawn at the time of the newest pose: the viewer may skip frames, they do not."""
+        """Draw the rates that nodes report, at the time of the newest pose. The viewer's own counts may skip frames."""
         for topic in RATE_RGB:
             if (rate := message.values.get(f"rate.{topic}")) is not None and self._origin_ns is not None:
                 self._scalar(f"plots/rates/{topic}", float(rate))
@@ -195,7 +196,7 @@ class PoseView:
         import rerun as rr
 
         if truth and not self._calibrated:
-            return  # the poses have a world of their own, and where that lies in the true one is not known
+            return  # without calibration, the transform between the poses' world and the true world is unknown
         for body in message.bodies:
             positions = body.positions.astype(np.float64)
             if truth:
@@ -222,7 +223,7 @@ class PoseView:
             yield path, positions
 
     def _body(self, path: str, positions: NDArray, state: NDArray[np.uint8], sigma: NDArray[np.floating]) -> None:
-        """A body in the colours of its sides, faint if not observed; around an imputed joint a sphere of one sigma."""
+        """Draw a body in its sides' colours, faint where not observed, with a sphere of one sigma at imputed joints."""
         import rerun as rr
 
         observed = np.isin(bone_states(state), OBSERVED)[:, None]
@@ -252,7 +253,7 @@ class PoseView:
         self._log(path, rr.LineStrips3D(ends[drawable], colors=colours, radii=radius))
 
     def _way(self, path: str, message: PoseWorld, body: WorldBody) -> NDArray[np.float64]:
-        """(N, 3) the body's way over the floor in the last seconds."""
+        """(N, 3) path of the body over the floor in the last seconds, metres."""
         way = self._paths.setdefault(path, deque())
         way.append((message.stamp_ns, np.array([*body.root_position[:2], 0.005])))
         while message.stamp_ns - way[0][0] > PATH_SECONDS * 1e9 or way[0][0] > message.stamp_ns:
@@ -273,7 +274,7 @@ class PoseView:
         )
 
     def _set_time(self, topic: str, stamp_ns: int) -> None:
-        """Draw from now on at that moment; where a topic's stamps jump back, its time goes on from where it was."""
+        """Set the time of what is drawn next. If a topic's stamps jump back, its time continues from where it was."""
         if self._origin_ns is None:
             self._origin_ns = stamp_ns
         last_ns, origin_ns = self._last.get(topic, (stamp_ns, self._origin_ns))
@@ -291,7 +292,7 @@ class PoseView:
         self._recording.log(path, rr.Scalars(value))
 
     def _follow(self, topic: str, bodies: list[NDArray[np.float64]], *, calibrated: bool) -> None:
-        """Keep the eye on the bodies: first from the front of one of them, later from where the user turns it."""
+        """Keep the bodies in view: at first from the front of one of them, later from the user's own viewpoint."""
         import rerun as rr
 
         trunks = np.array([body[_TRUNK] for body in bodies]).reshape(-1, 3)
@@ -316,6 +317,6 @@ def _entity(root: str, source: str, body: RawBody | CleanBody | WorldBody) -> st
 
 
 def _grey(confidence: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """(J, 3) RGB: the higher the confidence, the whiter."""
+    """(J, 3) RGB greys; higher confidence is whiter."""
     shade = 70 + 185 * np.clip(np.nan_to_num(confidence), 0, 1)
     return np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)

@@ -1,5 +1,5 @@
-"""Keeps the last minutes of drawings and serves them with Rerun's page, to browsers that may see them
-(`nodes.sinks.serving`). A Content-Security-Policy restricts the page's connections to here.
+"""Keeps the last minutes of drawings, and serves them with Rerun's page to browsers with access
+(`nodes.sinks.serving`). A Content-Security-Policy restricts the page's connections to this server.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     import rerun as rr
 
 MOST_BYTES = 2**28
-"""of drawings that are kept for browsers that come later: about five minutes of one body"""
+"""Largest size of the drawings kept for browsers that connect later, bytes; about five minutes of one body."""
 FIRST = 100
-"""pieces that are never let go: names, colours and layout are among them"""
+"""Number of first pieces that are never dropped. They include names, colours and layout."""
 WAIT_S = 0.5
-"""for the next piece, before a reader looks whether its browser is still there"""
+"""Longest time a reader waits for the next piece before it checks whether its browser is connected, seconds."""
 
 
 class Drawings:
-    """Pieces of Rerun's data format, each whole by itself. For several threads."""
+    """A buffer of self-contained pieces of Rerun's data format. Thread-safe."""
 
     def __init__(self) -> None:
         self._first: list[bytes] = []
@@ -48,7 +48,7 @@ class Drawings:
         self._changed = threading.Condition()
 
     def add(self, piece: bytes) -> None:
-        """Keep a piece, and let the oldest go."""
+        """Add a piece, and drop the oldest ones beyond the limit."""
         with self._changed:
             if len(self._first) < FIRST:
                 self._first.append(piece)
@@ -61,8 +61,8 @@ class Drawings:
             self._changed.notify_all()
 
     def follow(self) -> Iterator[bytes]:
-        """The pieces that are kept, then each that comes; an empty one now and then, while none does."""
-        at = 0  # of all that ever were
+        """The kept pieces, then each new one; an empty one now and then while there is none."""
+        at = 0  # index among all pieces ever added
         while not self._closed:
             with self._changed:
                 first, later = self._first[at:], []
@@ -76,30 +76,31 @@ class Drawings:
             yield from first or later or [b""]
 
     def close(self) -> None:
-        """End what readers follow."""
+        """End the iteration of all readers."""
         self._closed = True
         with self._changed:
             self._changed.notify_all()
 
 
 KEPT = ("Content-Type", "Content-Length", "Content-Encoding", "Cache-Control", "ETag")
-"""headers of Rerun's responses that are passed on"""
+"""Headers of Rerun's responses that are passed on."""
 POLICY = (
     "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-src 'none'; form-action 'none'; base-uri 'self'"
 )
 DRAWINGS = "drawings.rrd"
-"""the last part of the drawings' path, after the token"""
+"""Last part of the drawings' path, after the token."""
 
 
 class PageServer:
-    """Serves another server's pages and the drawings, in threads.
+    """Serves another server's pages, and the drawings, in threads.
 
     Args:
-        host, port: to serve at.
+        host: address to serve at.
+        port: port to serve at.
         origin: the other server, such as ``http://127.0.0.1:40123``.
-        token: that the path of the drawings begins with.
-        drawings: that are served.
+        token: first part of the drawings' path.
+        drawings: the drawings to serve.
     """
 
     def __init__(self, host: str, port: int, origin: str, token: str, drawings: Drawings) -> None:
@@ -112,13 +113,13 @@ class PageServer:
                     self.send_error(403, "expected this machine's own name or address")
                     return
                 try:
-                    path = urlsplit(self.path).path  # what comes after is for the page in the browser
+                    path = urlsplit(self.path).path  # the query is for the page in the browser
                     if path.endswith(DRAWINGS):
                         self._send_drawings(path)
                     else:
                         self._send_page(path)
                 except (BrokenPipeError, ConnectionResetError):
-                    pass  # the browser has gone
+                    pass  # the browser disconnected
 
             def _send_drawings(self, path: str) -> None:
                 if not is_token(path, own_path):
@@ -161,7 +162,7 @@ class PageServer:
 
 LOOPBACK = "127.0.0.1"
 FLUSH_S = 0.05
-"""between batches of drawings: longer looks jerky, shorter costs more in wrapping than in drawings"""
+"""Interval between batches of drawings, seconds. Longer looks jerky; shorter costs more overhead than drawing."""
 
 
 class ViewerError(RuntimeError):
@@ -169,23 +170,23 @@ class ViewerError(RuntimeError):
 
 
 class ViewerServer(Closing):
-    """Keeps the drawings and serves them, with the page that shows them, to browsers that know the token.
+    """Keeps the drawings, and serves them and the page that shows them to browsers with the token.
 
-    It listens on this machine alone, unless set otherwise: a picture of people in a room is not for whoever shares
-    the network, nor, by the token, for other users of the machine. The page is that of a Rerun process, which has no
-    drawings, passed on with a Content-Security-Policy, so that a browser lets it call nobody but this server: by itself
-    it would send telemetry and ask for news of its version.
+    By default it listens on this machine only, so that others on the network cannot see the people. The token keeps out
+    other users of this machine. The page comes from a Rerun process that has no drawings. It is passed on with a
+    Content-Security-Policy that lets it connect only to this server; otherwise it would send telemetry and check for
+    new versions.
     """
 
     def __init__(self, port: int, host: str = LOOPBACK) -> None:
         """Start serving.
 
         Args:
-            port: of the page and the drawings.
+            port: port of the page and the drawings.
             host: address to serve at.
 
         Raises:
-            ViewerError: a port is taken, or the server does not come up.
+            ViewerError: the port is taken, or Rerun's server does not start.
         """
         self._page: PageServer | None = None
         self._drawings = Drawings()
@@ -198,7 +199,7 @@ class ViewerServer(Closing):
         self.data_url = f"{at}/{token}/{DRAWINGS}"
         self.url = f"{at}/?theme=dark&url={quote(self.data_url, safe='')}"
         binary = Path(next(iter(rerun_cli.__path__)), "rerun")
-        # The server must not outlive a node that is killed.
+        # preexec_fn: the server must not outlive a node that is killed
         self._process = subprocess.Popen(
             [str(binary), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(inner), "--port", str(unused)],
             stdout=subprocess.DEVNULL,
@@ -213,7 +214,7 @@ class ViewerServer(Closing):
             raise
 
     def show(self, recording: rr.RecordingStream) -> None:
-        """Serve what is drawn into a recording, from now on."""
+        """Serve everything drawn into a recording from now on."""
         import rerun as rr
 
         stream = rr.binary_stream(recording)
@@ -226,8 +227,10 @@ class ViewerServer(Closing):
         threading.Thread(target=read, daemon=True).start()
 
     def check(self) -> None:
-        """Raises:
-        RuntimeError: the server has stopped; to be started again, unlike what a `ViewerError` says.
+        """Check that Rerun's server is running.
+
+        Raises:
+            RuntimeError: the server has stopped. Unlike after a `ViewerError`, a restart helps.
         """
         if self._process.poll() is not None:
             raise RuntimeError(f"Rerun's server has stopped, exit code {self._process.returncode}")

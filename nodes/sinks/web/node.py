@@ -1,7 +1,7 @@
-"""The web sink: bodies, events and health in a browser, and for any program that reads JSON from a WebSocket.
+"""The web sink: bodies, events and node health as JSON over a WebSocket, for browsers and other programs.
 
-Messages have the form that docs/browser.md describes. Positions are in metres, to a tenth of a millimetre; what is not
-finite is null. Stamps are seconds of capture: a JavaScript number has no room for nanoseconds.
+docs/browser.md describes the messages. Positions are in metres, rounded to a tenth of a millimetre; values that are not
+finite are null. Stamps are capture times in seconds, because a JavaScript number cannot hold nanoseconds.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WebSettings:
-    """``[web]``: poses, events and health for browsers."""
+    """``[web]``: poses, events and node health for browsers."""
 
     host: str = "127.0.0.1"
-    """address to serve at. Any other than this machine's own sends poses, which are personal data, and the token in
-    clear text over the network; ``ssh -L 8766:localhost:8766 robot`` carries them safely"""
+    """address to serve at. An address of the network sends poses, which are personal data, and the token in clear text;
+    ``ssh -L 8766:localhost:8766 robot`` is the safe way from another machine"""
     port: int = 8766
-    """of the page and of the WebSocket; 0: any that is free"""
+    """port of the page and the WebSocket; 0: any free port"""
     names: list[str] = field(default_factory=list)
-    """other names by which browsers reach this machine, such as kiosk.local; under others nothing is served"""
+    """further host names by which browsers reach this machine, such as kiosk.local; requests for other names are
+    refused"""
     token: str = ""
-    """that a client must know; empty: one drawn at random, which is part of the address that is printed"""
+    """token that a client must give; empty: a random one, which is part of the printed address"""
 
     def __post_init__(self) -> None:
         check_host_and_port("web", self.host, self.port, least=0)
@@ -65,12 +66,12 @@ class WebSettings:
 
 
 TOKEN_FILE = "web_token"
-"""beside the sockets, in a folder that only this user reads: a node that is started again has the token that pages
-know"""
+"""Name of the file with the random token, in the directory of the sockets, which only this user can read. A restarted
+node reads it, so that open pages stay connected."""
 
 
 class WebNode(Node):
-    """Serves the newest messages to browsers; the pipeline never waits for it."""
+    """Serves the newest messages to browsers. The pipeline never waits for it."""
 
     name = "web"
 
@@ -81,11 +82,11 @@ class WebNode(Node):
 
     @property
     def url(self) -> str:
-        """Of the page, with the token; empty before it is served."""
+        """Address of the page, with the token; empty until it is served."""
         return self._server.url if self._server else ""
 
     def work(self) -> None:
-        from steadypose.nodes.sinks.web.server import WebServer  # not to read a launch file
+        from steadypose.nodes.sinks.web.server import WebServer  # not needed to read a launch file
 
         s = self._settings
         token = s.token or kept_token(self.launch.transport.ipc_directory / TOKEN_FILE)
@@ -115,7 +116,7 @@ class WebNode(Node):
 
 
 def kept_token(file: Path) -> str:
-    """The token in a file that only this user may read; made at the first call."""
+    """The token in a file that only this user can read; created on first use."""
     try:
         made = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
@@ -130,7 +131,7 @@ HELLO = "hello"
 
 
 def hello() -> str:
-    """What a client gets first: the names that the numbers of all other messages stand for."""
+    """The first message to a client: the names behind the numbers in all other messages."""
     return _text(
         {
             "topic": HELLO,
@@ -145,7 +146,7 @@ def hello() -> str:
 
 
 def to_json(message: Message) -> str | None:
-    """One message; None of what browsers do not get."""
+    """A message as JSON; None for messages that browsers do not receive."""
     if isinstance(message, PoseWorld):
         return _text(_header(POSE_WORLD, message) | {"bodies": [_body(body) for body in message.bodies]})
     if isinstance(message, PoseEvents):

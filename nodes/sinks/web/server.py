@@ -1,10 +1,11 @@
-"""Serves the page, and its WebSocket, from a thread of its own.
+"""Serves the page and its WebSocket, in a separate thread.
 
-**Who may** (`nodes.sinks.serving`). The WebSocket takes a token, which the printed address has after a ``#``, so that
-it is in no log and no ``Referer``. The page and the script hold nothing secret.
+**Access** (`nodes.sinks.serving`). The WebSocket requires a token. The printed address has it after a ``#``, so that it
+appears in no log and no ``Referer``. The page and its scripts contain nothing secret.
 
-**Who is slow.** A client has room for the newest message of each stream, and for some events; what it does not take
-before the next comes is dropped, and counted. So it is never behind by more than what its connection holds.
+**Slow clients.** Each client has a queue for the newest message of each stream, and for some events. A message that is
+not sent before the next one arrives is dropped and counted. A client is therefore never further behind than its
+connection's buffers.
 """
 
 from __future__ import annotations
@@ -32,31 +33,32 @@ STATIC = Path(__file__).parent / "static"
 FILES = {"/": "index.html", "/kiosk": "kiosk.html"} | {
     f"/{name}": name for name in ("page.js", "kiosk.js", "steadypose.js", "steadypose.d.ts")
 }
-"""what is served, by path; nothing else is"""
+"""Served files by path; no other path is served."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; img-src data:; connect-src 'self' {}; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 MAX_CLIENTS = 16
 EVENTS_KEPT = 64
-"""events are not replaced by newer ones: messages of them that a client may have waiting"""
+"""Largest number of event messages in a client's queue. Newer ones do not replace them."""
 STREAMS_KEPT = 64
-"""streams of which the newest message is kept for who connects later"""
+"""Largest number of streams whose newest message is kept for clients that connect later."""
 
 
 class WebServer:
     """HTTP and WebSocket at one port.
 
     Args:
-        host, port: to serve at; port 0 is any that is free.
-        names: by which it may be called, beside its host, and beside this machine's names for itself.
-        token: that a client must know.
-        greeting: what each client gets first.
+        host: address to serve at.
+        port: port to serve at; 0: any free port.
+        names: accepted host names besides ``host`` and this machine's own names.
+        token: token that a client must give.
+        greeting: first message to each client.
 
     Attributes:
-        url: of the page, with the token.
-        clients: how many are connected.
-        dropped: messages that slow clients did not take in time.
+        url: address of the page, with the token.
+        clients: number of connected clients.
+        dropped: number of messages dropped for slow clients.
 
     Raises:
         LaunchError: the port cannot be opened.
@@ -83,12 +85,12 @@ class WebServer:
         return len(self._clients)
 
     def send(self, stream: str, text: str, *, replaces: bool) -> None:
-        """Give a message to all clients.
+        """Send a message to all clients.
 
         Args:
-            stream: what it is the newest of.
-            text: JSON.
-            replaces: whether an older one of the same stream need not be sent any more.
+            stream: name of its stream.
+            text: the message as JSON.
+            replaces: whether it replaces an unsent older message of the same stream.
         """
         self._loop.call_soon_threadsafe(self._offer, stream, text, replaces)
 
@@ -106,10 +108,10 @@ class WebServer:
     async def _serve(self, host: str, port: int, started: Future[Server]) -> None:
         from websockets.asyncio.server import serve
 
-        logging.getLogger("websockets").setLevel(logging.WARNING)  # it has a line for each client that comes or goes
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # it logs every connection
         self._loop, self._closing = asyncio.get_running_loop(), asyncio.Event()
         try:
-            # nothing is expected from a client; compression would take 300 kB of each, for a connection in this machine
+            # clients send nothing; no compression, because it takes 300 kB per client and most are on this machine
             server = await serve(
                 self._talk, host, port, process_request=self._answer, compression=None, max_size=1024, max_queue=1,
                 close_timeout=1,
@@ -135,7 +137,7 @@ class WebServer:
             await asyncio.gather(feeding, return_exceptions=True)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The answer to a request; None lets it become a WebSocket."""
+        """The response to a request; None upgrades it to a WebSocket."""
         host = request.headers.get("Host", "")
         own = called(host, self._names)
         if own is None:
@@ -161,7 +163,7 @@ class WebServer:
 
 
 class _Client:
-    """What waits for one client."""
+    """The queue of one client."""
 
     def __init__(self) -> None:
         self._newest: dict[str, str] = {}
@@ -169,7 +171,7 @@ class _Client:
         self._waiting = asyncio.Event()
 
     def offer(self, stream: str, text: str, replaces: bool) -> int:
-        """Take a message; how many were dropped for it."""
+        """Queue a message. Returns the number of messages dropped for it."""
         if replaces:
             dropped = int(self._newest.pop(stream, None) is not None)
             self._newest[stream] = text
@@ -180,7 +182,7 @@ class _Client:
         return dropped
 
     async def next(self) -> str:
-        """The message that is due: events first, then of each stream the newest, in turns."""
+        """The next message to send: events first, then the newest of each stream in turn."""
         while not self._queue and not self._newest:
             self._waiting.clear()
             await self._waiting.wait()
@@ -188,7 +190,7 @@ class _Client:
 
 
 async def _feed(connection: ServerConnection, client: _Client, greeting: str) -> None:
-    """Send what waits, until the connection is closed."""
+    """Send queued messages until the connection is closed."""
     await connection.send(greeting)
     while True:
         await connection.send(await client.next())
@@ -212,5 +214,5 @@ def _file(name: str, host: str) -> Response:
         }
     )
     if name.startswith("steadypose."):
-        headers["Access-Control-Allow-Origin"] = "*"  # a page of somebody's own, from elsewhere, imports it
+        headers["Access-Control-Allow-Origin"] = "*"  # so that users' own pages on other hosts can import it
     return Response(HTTPStatus.OK, "OK", headers, body)
