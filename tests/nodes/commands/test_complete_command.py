@@ -87,7 +87,7 @@ def test_several_people_and_one_who_was_away(tmp_path: Path) -> None:
 def test_who_stands_on_the_pelvis_is_given_a_way(tmp_path: Path, capsys) -> None:
     positions = waving(60)
     complete(write(tmp_path / "in.npz", positions - positions[:, :1]), tmp_path / "out.npz")
-    assert "its trajectory is predicted from its motion" in capsys.readouterr().err
+    assert "the path is predicted from the motion" in capsys.readouterr().err
     out = np.load(tmp_path / "out.npz")
     assert np.ptp(out["positions"][:, 0], axis=0).max() < 1e-6
     assert np.ptp(out["world_positions"][:, 0, :2], axis=0).max() > 1e-3
