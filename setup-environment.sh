@@ -1,10 +1,10 @@
-# Sourced by ./steadypose and ./test, with $root: the checkout. `install EXTRA...` makes its .venv match uv.lock, with
-# these extras; quick when there is nothing to do. What is installed already stays.
+# Sourced by ./steadypose and ./test, with $root set to the checkout. `install EXTRA...` makes .venv match uv.lock with
+# these extras. It is quick if there is nothing to do, and keeps what is installed already.
 UV_VERSION=0.13.8
 
-# A Python to install with: 3.11 first, for most was measured on it; where ROS is sourced its own, for rclpy runs on no
-# other. A name on the PATH may be a stub that cannot run, or a shim: uv knows the environment by the real path, and makes
-# it anew for another.
+# Finds a Python to install with: if ROS is sourced ROS's own, because rclpy runs on no other; else 3.11 first, on which
+# most figures were measured. It prints the real path, because a name on PATH may be a stub that cannot run, or a shim,
+# and uv would recreate the environment if the path changed.
 find_python() {
     for name in ${ROS_DISTRO:+python3} python3.11 python3.12 python3.13 python3.10 python3; do
         if "$name" -I -c 'import sys
@@ -22,7 +22,7 @@ install_uv() {
     if [ -x "$root/.uv/bin/uv" ]; then
         return
     fi
-    # by the Python's own pip where that can: putting another into the new folder takes five seconds
+    # by the Python's own pip if it can do that, because installing pip into the new folder takes five seconds
     if "$1" -I -m pip --python "$1" --version >/dev/null 2>&1; then
         "$1" -I -m venv --without-pip "$root/.uv"
         "$1" -I -m pip --python "$root/.uv/bin/python" install --quiet --disable-pip-version-check "uv==$UV_VERSION"
@@ -47,15 +47,15 @@ install() {
     for extra in "$@"; do
         extras="$extras --extra $extra"
     done
-    # shellcheck disable=SC2086  (words, on purpose)
+    # shellcheck disable=SC2086  (split into words on purpose)
     (unset VIRTUAL_ENV UV_PROJECT_ENVIRONMENT &&
         "$root/.uv/bin/uv" sync --project "$root" --frozen --inexact --python "$python" $extras)
-    # else the first stream would wait for it
+    # compiles the loops now, so that the first stream does not wait for it
     "$root/.venv/bin/python" -I -m steadypose.nodes.graph.loops
     touch "$stamp"
 }
 
-# Extras by name, on top of what is installed.
+# Installs extras by name, in addition to what is installed.
 add() {
     known=$(sed -n '/^\[project.optional-dependencies\]/,/^\[/s/^\([a-z0-9-]*\) = \[.*/\1/p' "$root/pyproject.toml")
     if [ $# -eq 0 ]; then

@@ -1,7 +1,7 @@
 """Starts steadypose: ros2 launch steadypose_ros steadypose.launch.py launch:=oak.toml namespace:=robot"""
 
 # pyright: reportMissingImports=false
-# comes with ROS
+# these packages are installed with ROS
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def generate_launch_description() -> LaunchDescription:
         namespace=given["namespace"],
         parameters=[{name: given[name] for name in ("launch", "command")}, given["params_file"]],
         output="screen",
-        sigterm_timeout="20",  # the program ends its recording first
+        sigterm_timeout="20",  # time for the program to complete its recording
     )
     arguments = [
         DeclareLaunchArgument(name, default_value=it, description=what) for name, (it, what) in ARGUMENTS.items()

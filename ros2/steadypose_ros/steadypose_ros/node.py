@@ -1,10 +1,10 @@
-"""steadypose as a lifecycle node: configured from parameters, running while it is active.
+"""steadypose as a lifecycle node: configured by parameters, running while active.
 
-The program is installed apart, with a Python of its own; nothing of it is imported here.
+The steadypose program is installed separately, with its own Python. This node starts it, and imports nothing of it.
 """
 
 # pyright: reportMissingImports=false
-# rclpy comes with ROS
+# rclpy is installed with ROS
 
 from __future__ import annotations
 
@@ -22,29 +22,31 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 OWN = {"launch": "ros2", "command": "steadypose", "autostart": True}
-"""parameters of the node, and their defaults; every other is a setting of steadypose's launch file"""
+"""The node's own parameters and their defaults. Any other parameter is a setting of steadypose's launch file."""
 OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+"""Prefixes of ROS's own parameters, which are not passed on."""
 STOPS_WITHIN_S = 15.0
+"""Time after which a program that does not stop is killed, seconds."""
 
 
 def arguments(parameters: Mapping[str, Any], namespace: str) -> list[str]:
     """The command line of steadypose.
 
     Args:
-        parameters: all of the node, by name: ``OWN``, and ``section.key`` of a launch file.
-        namespace: of the node, such as ``/robot``; that of the topics unless ``ros2.namespace`` says otherwise.
+        parameters: all parameters of the node by name: ``OWN``, and ``section.key`` of a launch file.
+        namespace: the node's namespace, such as ``/robot``; also that of the topics, unless ``ros2.namespace`` is set.
     """
     settings = {name: it for name, it in parameters.items() if name not in OWN and not name.startswith(OF_ROS)}
     settings.setdefault("ros2.namespace", namespace.strip("/"))
     command = [parameters["command"], "run", parameters["launch"]]
     for name, value in settings.items():
         plain = value if isinstance(value, (bool, int, float, str)) else list(value)
-        command += ["--set", f"{name}={json.dumps(plain, ensure_ascii=False)}"]  # as TOML spells it too
+        command += ["--set", f"{name}={json.dumps(plain, ensure_ascii=False)}"]  # JSON values are valid TOML here
     return command
 
 
 class SteadyposeNode(LifecycleNode):
-    """Active while the program runs: what ends by itself, or fails, leaves the node inactive."""
+    """A lifecycle node that is active while the program runs. When the program ends or fails, it becomes inactive."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -70,7 +72,7 @@ class SteadyposeNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.get_logger().info(" ".join(self._command))
-        # in a session of its own: Ctrl-C reaches this node, which passes it on once
+        # in a separate session, so that Ctrl-C reaches only this node, which passes it on once
         self._program = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, start_new_session=True, preexec_fn=_end_with_parent
         )
@@ -85,7 +87,7 @@ class SteadyposeNode(LifecycleNode):
         return super().on_shutdown(state)
 
     def stop(self) -> None:
-        """End the program, as Ctrl-C does, and wait for it."""
+        """Stop the program as Ctrl-C does, and wait for it to end."""
         program, self._program = self._program, None
         if program is None or program.poll() is not None:
             return

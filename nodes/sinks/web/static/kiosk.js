@@ -1,4 +1,4 @@
-// A kiosk: whoever is near raises a hand to start, and it is over when they have left.
+// Example of a kiosk: a person nearby raises a hand to start, and the session ends when they leave.
 import { connect } from "./steadypose.js";
 
 const text = document.getElementById("text");

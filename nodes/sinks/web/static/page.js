@@ -1,10 +1,10 @@
-// The page: bodies on a floor that can be turned, what they do, and how the nodes are.
+// The page: bodies on a floor that can be rotated, their events, and the health of the nodes.
 import { connect } from "./steadypose.js";
 
 const [LEFT, RIGHT, MIDDLE, CONTACT] = ["#56b4e9", "#f08c2e", "#d7dbe4", "#f0c808"];
 const [INFERRED, FAINT] = [3, 0.3]; // the state of a joint that was not observed, and its opacity
-const TALL = 2.1; // metres of room above the floor
-const KEPT = 40; // events in the list
+const TALL = 2.1; // height of the space shown above the floor, metres
+const KEPT = 40; // number of events in the list
 const STALE_S = 3;
 
 const canvas = document.getElementById("canvas");
@@ -87,7 +87,7 @@ function paint() {
   for (const body of bodies) person(body, project);
 }
 
-// The eye keeps to the middle of those who are there, as near as all are in view.
+// The viewpoint follows the middle of the bodies, at a distance at which all are in view.
 function follow(bodies) {
   if (!bodies.length) return;
   let spread = 0;

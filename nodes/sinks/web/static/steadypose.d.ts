@@ -1,4 +1,4 @@
-// Types of steadypose.js. Lengths are metres in a right-handed world with z up; stamps are seconds of capture.
+// Types of steadypose.js. Lengths are in metres, in a right-handed world with z up; stamps are capture times, seconds.
 
 export type Vector = [x: number, y: number, z: number];
 export type EventKind =
@@ -18,13 +18,13 @@ export interface Names {
 export interface Body {
   id: number;
   tracking: "OK" | "COASTING" | "LOST";
-  /** of the pelvis */
+  /** position of the pelvis */
   root: Vector;
-  /** quaternion xyzw, from the body (+x forward, +y left, +z up) to the world */
+  /** quaternion xyzw, rotates from the body (+x forward, +y left, +z up) to the world */
   orientation: [number, number, number, number];
-  /** m/s, of the pelvis */
+  /** velocity of the pelvis, m/s */
   velocity: Vector;
-  /** of the joints, in the order of Names.joints; null where there is no estimate */
+  /** positions of the joints, in the order of Names.joints; null where there is no estimate */
   positions: ([number | null, number | null, number | null])[];
   /** indices into Names.states */
   state: number[];
@@ -52,7 +52,7 @@ export interface PoseEvent {
   hand: "NONE" | "LEFT" | "RIGHT";
   /** 0 to 1: probability of the condition, given the joints' standard deviations */
   confidence: number | null;
-  /** of POINTS: unit vector from the head through the wrist */
+  /** direction of POINTS: unit vector from the head through the wrist */
   direction: Vector | null;
   since: number;
 }
@@ -63,7 +63,7 @@ export interface PoseEvents {
   frame: string;
   source: string;
   end: boolean;
-  /** all that begins, holds or ends at this moment */
+  /** all events that begin, hold or end at this time */
   events: PoseEvent[];
 }
 
@@ -88,5 +88,5 @@ export interface Connection {
   close(): void;
 }
 
-/** Connect, and connect again whenever the connection is lost. The token is what the printed address has after its #. */
+/** Connects, and reconnects whenever the connection is lost. The token follows the # in the printed address. */
 export function connect(options?: { token?: string; url?: string }): Connection;

@@ -1,11 +1,11 @@
-// steadypose in a browser: poses, events and health over a WebSocket. No dependencies, no build step.
+// steadypose in a browser: poses, events and node health over a WebSocket. No dependencies, no build step.
 //
 //   import { connect } from "http://127.0.0.1:8766/steadypose.js";
 //   const pose = connect({ token: "..." });
 //   pose.on("world", ({ bodies }) => bodies.forEach((body) => console.log(body.joint("left_wrist"))));
 //   pose.on("event", (event) => console.log(event.phase, event.kind, event.hand));
 //
-// All lengths are metres in a right-handed world with z up; stamps are seconds of capture.
+// Lengths are in metres, in a right-handed world with z up; stamps are capture times in seconds.
 
 const HERE = new URL(import.meta.url);
 const SHORTEST_MS = 500;
@@ -17,7 +17,7 @@ class Body {
     Object.defineProperty(this, "names", { value: names });
   }
 
-  // Position [x, y, z] of a joint by name; null where there is no estimate, an error where there is no such joint.
+  // Position [x, y, z] of a joint by name; null if there is no estimate. Throws if there is no such joint.
   joint(name) {
     const index = this.names.joints.indexOf(name);
     if (index < 0) throw new RangeError(`no joint ${name}: there are ${this.names.joints.join(", ")}`);
@@ -41,8 +41,8 @@ class Connection {
     this.#open();
   }
 
-  // Call a function with each message of a kind: "world", "events", "event" (each that begins or ends), "health",
-  // "state". Returns a function that ends it.
+  // Calls a function with each message of a kind: "world", "events", "event" (each event that begins or ends),
+  // "health", "state". Returns a function that unsubscribes.
   on(kind, handler) {
     if (!["world", "events", "event", "health", "state"].includes(kind)) {
       throw new RangeError(`no messages of kind ${kind}: there are world, events, event, health, state`);
@@ -98,8 +98,8 @@ class Connection {
   }
 }
 
-// Connect, and connect again whenever the connection is lost.
-// options: token, which the printed address has after its #; url of the WebSocket, unless it is where this file is from.
+// Connects, and reconnects whenever the connection is lost.
+// Options: token, which follows the # in the printed address; url of the WebSocket, by default on this file's host.
 export function connect({ token = location.hash.slice(1), url = `${HERE.origin.replace(/^http/, "ws")}/ws` } = {}) {
   return new Connection({ token, url });
 }
