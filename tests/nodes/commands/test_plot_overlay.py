@@ -126,5 +126,5 @@ def test_another_video_is_refused(tmp_path: Path, cleaned: list[PoseClean], vide
     assert not (tmp_path / "out.mp4").exists()
     with pytest.raises(PlotError, match="over: expected a video that OpenCV can read"):
         plot(tmp_path / "bag", video=tmp_path / "out.mp4", over=tmp_path / "nowhere.mp4")
-    with pytest.raises(PlotError, match="as well: --video"):
+    with pytest.raises(PlotError, match="expected --video"):
         plot(tmp_path / "bag", over=video)
