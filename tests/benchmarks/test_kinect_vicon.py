@@ -82,13 +82,6 @@ def test_clips_side_by_side_are_filtered_as_if_alone(run: partial) -> None:
         np.testing.assert_allclose(answer, run_filter([one], run)[0], atol=1e-12)
 
 
-def test_a_delay_of_zero_knows_nothing_of_later_frames() -> None:
-    here = clip(4, 20)
-    cut = here._replace(raw=here.raw[:11])
-    run = partial(constant_velocity, delay=0, density=1.0)
-    np.testing.assert_array_equal(run_filter([here], run)[0][:11], run_filter([cut], run)[0])
-
-
 def test_what_is_stated_is_held_against_the_error() -> None:
     rng = np.random.default_rng(5)
     sigma = rng.uniform(0.01, 0.1, (400, len(SCORED)))

@@ -12,7 +12,6 @@ from tests.nodes.conftest import walk
 import steadypose
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.output import clean_recording
-from steadypose.prior.body.layouts import SKELETONS, add_layouts
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)
@@ -49,22 +48,7 @@ def test_several_bodies() -> None:
     assert np.abs(given["positions"][-1, 1, :, 0] - joints[-1, 1, :, 0]).max() < 0.1
 
 
-@pytest.mark.usefixtures("own_layouts")
-def test_a_layout_of_ones_own(tmp_path: Path) -> None:
-    """The canonical joints under other names, in another order: the same answer."""
-    order = np.random.default_rng(0).permutation(22)
-    names = [f"j{index}" for index in order]
-    smpl = SKELETONS["smpl22"].joints
-    add_layouts({"shuffled": {"joints": names, "canonical": {smpl[index]: f"j{index}" for index in order}}})
-    given = steadypose.clean(walked()[:, order], fps=30.0, skeleton="shuffled")
-    np.testing.assert_allclose(given["positions"], steadypose.clean(walked(), fps=30.0)["positions"], atol=1e-6)
-
-
 def test_what_is_missing_is_named() -> None:
-    with pytest.raises(ValueError, match="fps"):
-        steadypose.clean(walked())
-    with pytest.raises(ValueError, match=r"\(T, 17, 3\), or \(T, bodies, 17, 3\), for coco17"):
-        steadypose.clean(walked(), fps=30, skeleton="coco17")
     with pytest.raises(AttributeError, match="cleanse"):
         steadypose.cleanse  # noqa: B018  # type: ignore[attr-defined]
 

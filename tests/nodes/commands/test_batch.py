@@ -15,7 +15,6 @@ import pytest
 from conftest import record, walk
 from rich.console import Console
 
-from steadypose.msgs.types import JOINTS
 from steadypose.nodes.commands import batch
 from steadypose.nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from steadypose.nodes.commands.clean import clean
@@ -214,13 +213,16 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
         (tmp_path / "loose" / f"{name}.mcap").write_bytes((killed / "killed_0.mcap").read_bytes())
     write_npz(tmp_path / ".hidden" / "a.npz", frames=2)
     (tmp_path / "loop").symlink_to(tmp_path)
+    (tmp_path / "table.csv").touch()
     assert [is_folder_of_recordings(path) for path in (one, killed, tmp_path / "loose", tmp_path)] == [
         False, False, True, True,
     ]  # fmt: skip
     found = find_recordings(tmp_path)
-    assert [str(path.relative_to(tmp_path)) for path in found] == ["killed", "loose/x.mcap", "loose/y.mcap", "one"]
+    assert [str(path.relative_to(tmp_path)) for path in found] == [
+        "killed", "loose/x.mcap", "loose/y.mcap", "one", "table.csv",
+    ]  # fmt: skip
     outputs = [str(job.out) for job in plan(tmp_path, Path("o"))]
-    assert outputs == ["o/killed", "o/loose/x", "o/loose/y", "o/one"]
+    assert outputs == ["o/killed", "o/loose/x", "o/loose/y", "o/one", "o/table.npz"]
 
 
 @pytest.mark.parametrize(
@@ -250,17 +252,6 @@ def test_folders_that_hold_nothing_or_two_of_a_name(tmp_path: Path) -> None:
     (tmp_path / "other.mcap").write_bytes(b"")
     with pytest.raises(LaunchError, match="would both become"):
         clean(tmp_path, tmp_path.parent / "out")
-
-
-def test_a_table_becomes_npz(tmp_path: Path, options: tuple[str, ...], here: list[Job]) -> None:
-    positions = np.array([frame.bodies[0].positions for frame in walk(FRAMES)])
-    (tmp_path / "in").mkdir()
-    header = ",".join(f"{joint}_{axis}" for joint in JOINTS for axis in "xyz")
-    rows = [",".join([f"{k / 30:.6f}", *map(str, frame.ravel())]) for k, frame in enumerate(positions)]
-    (tmp_path / "in" / "walk.csv").write_text("\n".join([f"stamp,{header}", *rows]))
-    assert clean(tmp_path / "in", tmp_path / "out", settings=options) == 0
-    with np.load(tmp_path / "out" / "walk.npz") as out:
-        assert out["positions"].shape == (FRAMES, 22, 3)
 
 
 def test_jobs_are_for_folders(tmp_path: Path) -> None:

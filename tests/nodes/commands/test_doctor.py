@@ -67,10 +67,6 @@ def test_a_check_that_breaks_is_a_finding_and_the_others_go_on(
     assert "fine" in out
 
 
-def test_packages_are_there() -> None:
-    assert verdicts(command.check_packages)["packages"] is Verdict.GOOD
-
-
 def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(name: str) -> str:
         if name in ("pyzmq", "rerun-sdk"):

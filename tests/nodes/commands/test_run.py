@@ -1,22 +1,18 @@
-"""Processes watched and started again, and the whole command from a recording to a recording."""
+"""Processes watched and started again, and what a run says of its nodes, and when it is over."""
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import VirtualClock, record, until, walk
+from conftest import VirtualClock, until
 from rich.console import Console
 
-from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import Diagnostics, Level, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.commands.run import STALL_NS, _Run, line, table
 from steadypose.nodes.graph import supervisor
 from steadypose.nodes.graph.launch import Launch
@@ -313,105 +309,3 @@ def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Laun
         "prior: ERROR: stamp is 0: expected more [stamps_zero]",
         "prior: no longer: stamps_zero",
     ]
-
-
-def steadypose(*arguments: str, folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "steadypose.nodes.cli", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-    )
-
-
-def children(process: subprocess.Popen[str]) -> dict[str, int]:
-    """The process ids of a run's nodes, by name."""
-    found = {}
-    for child in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
-        _, _, after = Path(f"/proc/{child}/cmdline").read_text().partition("\0node\0")
-        found[after.partition("\0")[0]] = int(child)
-    return found
-
-
-def poses_recorded(directory: Path) -> bool:
-    """Whether a recording in the making has grown beyond its header."""
-    files = list(directory.glob("*.mcap"))
-    return bool(files) and files[0].stat().st_size > 50_000
-
-
-def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(
-    tmp_path: Path, folder: Path, weights: dict[str, str]
-) -> None:
-    record(tmp_path / "in", walk(150))
-    settings = [part for key, value in weights.items() for part in ("--set", f"{key}={value}")]
-    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out")]
-    process = steadypose("run", *where, *settings, folder=folder)
-    try:
-        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=240)
-        os.kill(children(process)["prior"], signal.SIGKILL)
-        output, _ = process.communicate(timeout=240)
-    finally:
-        process.kill()
-    assert process.returncode == 0, output
-    assert "prior: ended with SIGKILL; starting it again" in output
-    with RecordingReader(tmp_path / "out") as reader:
-        assert reader.complete
-        assert reader.count(POSE_RAW) == 151, "the recorder heard every frame"
-        assert reader.count(POSE_CLEAN) == reader.count(POSE_WORLD) == 151, "each answered, and once"
-        for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):
-            *_, last = reader.messages([topic])
-            assert isinstance(last.message, PoseRaw | PoseClean | PoseWorld)
-            assert last.message.end_of_stream
-
-
-def test_ctrl_c_ends_all_and_completes_the_recording(tmp_path: Path, folder: Path) -> None:
-    record(tmp_path / "in", walk(60))
-    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"), "--loop"]
-    process = steadypose("run", *where, "--set", 'nodes=["pose_input"]', folder=folder)
-    try:
-        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=120)
-        nodes = children(process)
-        process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 0, output
-    assert set(nodes) == {"pose_input", "recorder"}
-    assert not [pid for pid in nodes.values() if Path(f"/proc/{pid}").exists()]
-    with RecordingReader(tmp_path / "out") as reader:
-        assert reader.complete
-
-
-def test_nodes_do_not_outlive_a_run_that_is_killed(tmp_path: Path, folder: Path) -> None:
-    record(tmp_path / "in", walk(60))
-    where = ["--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"), "--loop"]
-    process = steadypose("run", *where, "--set", 'nodes=["pose_input"]', folder=folder)
-    try:
-        until(lambda: poses_recorded(tmp_path / "out"), timeout_s=120)
-        nodes = children(process)
-    finally:
-        process.kill()
-        process.communicate()
-    until(lambda: not any(running(pid) for pid in nodes.values()))
-    with RecordingReader(tmp_path / "out") as reader:
-        assert reader.complete
-
-
-def running(pid: int) -> bool:
-    """Whether a process works still; one that ended and that nobody has asked about does not."""
-    try:
-        return ") Z" not in Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return False
-
-
-def test_a_node_that_cannot_start_ends_the_run(tmp_path: Path, folder: Path) -> None:
-    record(tmp_path / "in", walk(5))
-    (tmp_path / "file").touch()
-    settings = ["--set", 'nodes=["pose_input"]', "--set", f"transport.endpoints.pose_input=ipc://{tmp_path}/file"]
-    process = steadypose("run", "--input", str(tmp_path / "in"), *settings, folder=folder)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert "expected no file there" in output
-    assert "Traceback" not in output

@@ -6,10 +6,12 @@ import time
 from collections.abc import Callable
 
 import pytest
-from conftest import VirtualClock, walk
+from conftest import START_NS, VirtualClock, walk
 
-from steadypose.nodes.graph.clock import SystemClock
+from steadypose.msgs.types import Message
+from steadypose.nodes.graph.clock import SystemClock, Timeline
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.supervisor import HUNG_S
 from steadypose.nodes.sources.pose_input import PoseInputNode
 
@@ -19,9 +21,7 @@ HOUR_NS = 3_600_000_000_000
 class SetClock(VirtualClock):
     """Time whose wall clock can be set."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.set_ns = 0
+    set_ns = START_NS
 
     def now_ns(self) -> int:
         return self.time_ns + self.set_ns
@@ -41,7 +41,7 @@ def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_n
     node = PoseInputNode(make_launch(), clock, _Source())  # type: ignore[arg-type]
     for k, frame in enumerate(frames):
         if k == 5:
-            clock.set_ns = step_ns
+            clock.set_ns += step_ns
         before = clock.time_ns
         node.report = lambda: None  # type: ignore[method-assign]
         node._wait_for(frame.stamp_ns, frame.stamp_ns)
@@ -53,3 +53,24 @@ def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_n
 
 class _Source:
     """In a recording's place: the test itself gives the frames."""
+
+
+class Listener(Node):
+    """A node of the graph that only measures."""
+
+    name = "prior"
+
+    def handle(self, topic: str, message: Message) -> None: ...
+
+
+@pytest.mark.parametrize("step_ns", [10 * 365 * 86400 * 10**9, -(10**9)])
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Launch], step_ns: int, rate: float) -> None:
+    clock = SetClock()
+    node = Listener(make_launch(nodes='["prior"]'), clock)
+    node.timeline = timeline = Timeline(1_000, clock.now_ns(), rate)
+    clock.time_ns += 1_000_000_000
+    stamp_ns = timeline.stamp_at(clock.now_ns()) - round(20_000_000 * rate)
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
+    clock.set_ns += step_ns
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)

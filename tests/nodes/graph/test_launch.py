@@ -47,6 +47,7 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input]\nloop = 1", "loop"),
         ("input = 3", "expected a section"),
         ("nodes = ['priro']", "did you mean 'prior'"),
+        ("nodes = []", "nodes: expected one or more of pose_input, prior"),
         ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
         ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
         ("[transport.endpoints]\nprior = 7101", "expected an address"),

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import START_NS, VirtualClock, record, running, until, walk
-from test_processes import Run
+from conftest import record, running, until, walk
+from test_processes import INPUT_ALONE, Run
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
 from steadypose.msgs.transport import Subscriber
-from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph.clock import Timeline
+from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.node import SUPERVISOR, WATCHER, Node
+from steadypose.nodes.graph.node import SUPERVISOR, WATCHER
 from steadypose.nodes.graph.process import own_command, own_environment, stop_on_signals
 from steadypose.nodes.graph.run_state import HEALTH_FILE, RunLock
 from steadypose.nodes.settings import LaunchError
@@ -29,8 +28,6 @@ from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
 
 pytestmark = pytest.mark.slow
-
-INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
 
 
 @pytest.fixture
@@ -56,18 +53,6 @@ def recording(tmp_path: Path) -> Path:
     return record(tmp_path / "in", walk(90))
 
 
-def test_the_end_of_the_terminal_stops_all_in_order(begin: Any, recording: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    run: Run = begin(
-        "--input", str(recording), "--record", str(out), "--loop", *INPUT_ALONE, "--set", "recorder.free_mb=0"
-    )
-    run.until_running("recorder")
-    run.process.send_signal(signal.SIGHUP)
-    status, output = run.wait()
-    assert status == 0, output
-    assert (out / "metadata.yaml").exists(), "the recorder was stopped, not killed"
-
-
 def test_nohup_is_obeyed() -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
     try:
@@ -78,11 +63,6 @@ def test_nohup_is_obeyed() -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def test_a_launch_of_no_node_is_refused(make_launch: Callable[..., Launch]) -> None:
-    with pytest.raises(LaunchError, match="nodes: expected one or more of pose_input, prior"):
-        make_launch(nodes="[]")
 
 
 def test_a_second_run_is_refused_and_the_first_is_left_alone(begin: Any, recording: Path, folder: Path) -> None:
@@ -198,36 +178,6 @@ def test_a_recording_launch_started_again_records_on(tmp_path: Path, make_launch
     assert free_directory(replay) == tmp_path / "out-3"
     (out / "notes.txt").write_text("somebody's own")
     assert free_directory(live) == tmp_path / "out-3"
-
-
-class Listener(Node):
-    """A node of the graph that only measures."""
-
-    name = "prior"
-
-    def handle(self, topic: str, message: Message) -> None: ...
-
-
-class SetClock(VirtualClock):
-    """A wall clock that can be set."""
-
-    set_ns = START_NS
-
-    def now_ns(self) -> int:
-        return self.time_ns + self.set_ns
-
-
-@pytest.mark.parametrize("step_ns", [10 * 365 * 86400 * 10**9, -(10**9)])
-@pytest.mark.parametrize("rate", [1.0, 2.0])
-def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Launch], step_ns: int, rate: float) -> None:
-    clock = SetClock()
-    node = Listener(make_launch(nodes='["prior"]'), clock)
-    node.timeline = timeline = Timeline(1_000, clock.now_ns(), rate)
-    clock.time_ns += 1_000_000_000
-    stamp_ns = timeline.stamp_at(clock.now_ns()) - round(20_000_000 * rate)
-    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
-    clock.set_ns += step_ns
-    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
 
 
 HOSTILE = (

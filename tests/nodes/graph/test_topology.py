@@ -1,4 +1,4 @@
-"""The declarations of the nodes name what exists, and agree with each other."""
+"""The declarations of the nodes and of the sources name what exists, and agree with each other."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
 from steadypose.nodes.extras import EXTRAS
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, load, publishers
+from steadypose.nodes.sources.registry import SOURCES, InputSettings
+from steadypose.nodes.sources.source import LiveSource
 
 
 @pytest.mark.parametrize("name", NODES)
@@ -25,6 +27,18 @@ def test_a_declaration_names_what_exists(name: str) -> None:
     assert declared.extra in {"", *EXTRAS}
     if declared.preflight:
         assert callable(load(declared.preflight))
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_declaration_of_a_source_names_what_exists(name: str) -> None:
+    declared, settings = SOURCES[name], getattr(InputSettings(), name)
+    assert not declared.extra or declared.extra in EXTRAS
+    if name == "recording":
+        assert settings == ""
+    else:
+        assert dataclasses.is_dataclass(settings)
+        # a class, or a function that chooses one
+        assert not isinstance(declared.opens, type) or issubclass(declared.opens, LiveSource)
 
 
 def test_a_node_subscribes_to_what_another_publishes() -> None:

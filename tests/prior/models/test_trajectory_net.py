@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import torch
 
@@ -45,8 +42,3 @@ def test_velocities_are_divided_by_the_time_between_frames() -> None:
     once, twice = (velocity_features(joints, before, dt, np.zeros(1)).reshape(22, 6) for dt in (0.1, 0.2))
     np.testing.assert_allclose(once[:, 3:], 2.0 * twice[:, 3:])
     np.testing.assert_array_equal(once[:, :3], twice[:, :3])
-
-
-def test_config_survives_json() -> None:
-    config = TrajectoryConfig(hidden=5, sigma_scale=(1.1, 0.9), correlation_s=(0.4, 0.2))
-    assert TrajectoryConfig.from_dict(json.loads(json.dumps(asdict(config)))) == config
