@@ -1,5 +1,7 @@
-"""The compiler of the loops: numba's, with the cache of `loop_cache`; and what loops use in place of numpy's functions,
-of which numba compiles every case for seconds."""
+"""The compiler of loops: numba's, with the cache of `loop_cache`; and a median for loops.
+
+Loops use this median, because numba takes seconds to compile numpy's with all its cases.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from steadypose.prior import loop_cache
 
 
 class _LoopCache(_Cache):
-    """Where a dispatcher of numba looks for what it has compiled."""
+    """The cache in which a numba dispatcher looks for compiled code."""
 
     def __init__(self, dispatcher: Any) -> None:
         self._dispatcher = dispatcher
@@ -27,7 +29,7 @@ class _LoopCache(_Cache):
     def load_overload(  # pyright: ignore[reportIncompatibleMethodOverride]  (numba's own gives one too)
         self, sig: Any, target_context: Any
     ) -> CompileResult | None:
-        rtsys.initialize(target_context)  # not all that a compiler needs, which takes half a second
+        rtsys.initialize(target_context)  # only this part: initialising the whole compiler takes half a second
         key = self._key(sig, target_context.codegen())
         payload = loop_cache.load(self._name(key), key)
         if payload is None:
@@ -36,7 +38,7 @@ class _LoopCache(_Cache):
         return CompileResult._rebuild(target_context, *payload)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if not data.library.has_dynamic_globals:  # addresses of this process
+        if not data.library.has_dynamic_globals:  # such code contains addresses of this process
             key = self._key(sig, data.codegen)
             *parts, environments = data._reduce()
             kept = (*parts, tuple(map(_without_globals, environments)))
@@ -60,22 +62,22 @@ class _LoopCache(_Cache):
 
 
 def _without_globals(environment: Environment) -> Environment:
-    """What a loop needs of a function that it calls: not its module, of which the compiler's take 0.3 s to import."""
+    """Return a function's environment without its module: importing the compiler's modules takes 0.3 s."""
     kept = Environment({"__name__": "numba"})
     kept.consts[:], kept.env_name = environment.consts, environment.env_name
     return kept
 
 
 def njit(*signature: str, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` with a cache that a power failure, another version or a read-only disk does not stop.
+    """``numba.njit`` with a cache that survives power failures, version changes and read-only disks.
 
-    A division by zero is infinite or NaN, as numpy has it: a test and an exception at each division take a tenth of
-    the time of compiling.
+    Division by zero gives infinity or NaN, as in numpy. Tests and exceptions at each division would take a tenth of the
+    compile time.
 
     Args:
-        signature: of the arguments, to compile as the module is imported; none: at the first call.
-        cache: as numba has it; always true.
-        options: numba's.
+        signature: types of the arguments, to compile on import; if omitted, compile at the first call.
+        cache: numba's option; always true.
+        options: numba's options.
     """
     assert cache, "a loop that is not kept would be compiled at every start"
 
@@ -94,7 +96,7 @@ def njit(*signature: str, cache: bool, **options: Any) -> Callable[[Callable[...
 
 @njit(cache=True)
 def median(values):
-    """The median of a few values (N,), N at least 1: by insertion, which leaves ``values`` as they are."""
+    """Return the median of a few values (N,), at least one, by insertion sort; does not change ``values``."""
     count = len(values)
     ordered = np.empty(count)
     for k in range(count):

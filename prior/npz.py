@@ -1,4 +1,4 @@
-"""Archives of arrays, opened only if their headers keep a size limit: two megabytes may unpack to five thousand."""
+"""Opens archives of arrays only if their headers respect a size limit, as two megabytes can unpack to five thousand."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from numpy.lib import format as npy
 from numpy.lib.npyio import NpzFile
 
 MAX_BYTES = 2**29
-"""of one array: nine hours of a skeleton of 22 joints at 30 frames a second, in double precision"""
+"""Largest size of one array, bytes: nine hours of a 22-joint skeleton at 30 frames per second in double precision."""
 
 MAX_RATIO = 100
-"""of the bytes of all arrays by those of the file, above `RATIO_FROM`: joints that are noisy come to ten"""
+"""Largest ratio of all arrays' bytes to the file's bytes, above `RATIO_FROM`; noisy joints have a ratio of ten."""
 RATIO_FROM = 2**26
 MAX_ARRAYS = 20_000
-"""of a file: a header takes a tenth of a millisecond to look at; UI-PRMD has three thousand"""
+"""Largest number of arrays in a file. Checking a header takes 0.1 ms; UI-PRMD has three thousand arrays."""
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
 class MotionError(ValueError):
-    """A motion file is not what it should be; the message says what was expected and what is there."""
+    """A motion file is invalid; the message says what was expected and what was found."""
 
 
 def check_arrays(file: IO[bytes] | Path) -> None:
-    """Look at every array's header.
+    """Check every array's header.
 
     Raises:
-        ValueError: an array is larger than `MAX_BYTES`, or not as large as its header says; or there are more than
-            `MAX_ARRAYS`, or all of them are much larger than the file.
-        zipfile.BadZipFile, OSError: it is no archive, or cannot be read.
+        ValueError: an array is larger than `MAX_BYTES`, or its size differs from its header; or there are more than
+            `MAX_ARRAYS` arrays, or all arrays together are much larger than the file.
+        zipfile.BadZipFile, OSError: the file is no archive, or cannot be read.
     """
     with zipfile.ZipFile(file) as archive:
         entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
@@ -64,10 +64,10 @@ def check_arrays(file: IO[bytes] | Path) -> None:
 
 @contextmanager
 def open_npz(file: IO[bytes] | Path, *needs: str) -> Iterator[NpzFile]:
-    """Open an .npz that holds some arrays.
+    """Open an .npz that holds the arrays that it ``needs``.
 
     Raises:
-        MotionError: it is no .npz (or needs pickle, which can run code), or lacks an array.
+        MotionError: it is no .npz, needs pickle (which can run code), or lacks an array.
     """
     name = f"{file}: " if isinstance(file, Path) else ""
     if not zipfile.is_zipfile(file):
@@ -77,7 +77,7 @@ def open_npz(file: IO[bytes] | Path, *needs: str) -> Iterator[NpzFile]:
         if not isinstance(file, Path):
             file.seek(0)
         archive = np.load(file)
-    except Exception as error:  # of damaged bytes zipfile, zlib and numpy's parser of headers raise a dozen kinds
+    except Exception as error:  # on damaged bytes, zipfile, zlib and numpy's header parser raise a dozen kinds
         raise MotionError(f"{name}expected an .npz archive: {error}") from error
     assert isinstance(archive, NpzFile), "np.load gives one for every zip archive"
     with archive:

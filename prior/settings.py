@@ -13,11 +13,11 @@ from typing import Any, get_args, get_type_hints
 logger = logging.getLogger(__name__)
 
 RENAMED = {"prior.encode": "prior.reconstruct", "prior.bones": "prior.person", "server.kiosks": "server.clients"}
-"""Settings of version 0.2 by their former names, which 0.3 takes with a warning and 0.4 refuses."""
+"""Former names of settings in version 0.2. Version 0.3 accepts them with a warning; 0.4 refuses them."""
 
 
 def current_key(path: str) -> str:
-    """A setting's path, such as ``prior.bones.samples``, with or without its section, by its current name."""
+    """Return the current name of a setting's path, such as ``prior.bones.samples``, with or without its section."""
     for old, new in RENAMED.items():
         for former, name in ((old, new), (old.partition(".")[2], new.partition(".")[2])):
             if f"{path}.".startswith(f"{former}."):
@@ -27,10 +27,10 @@ def current_key(path: str) -> str:
 
 
 def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a section of a launch file by their current names.
+    """Return the settings of a launch file's section under their current names.
 
     Raises:
-        ValueError: one has both names.
+        ValueError: a setting is given under both names.
     """
     current: dict[str, Any] = {}
     for key, value in settings.items():
@@ -43,7 +43,7 @@ def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _warn_of_former_name(old: str, new: str) -> None:
-    """Once in a process."""
+    """Warn of a former name, once per process."""
     section, _, key = old.partition(".")
     logger.warning(
         "[%s] %s is now called %s: write that; a later version refuses %s", section, key, new.partition(".")[2], key
@@ -51,10 +51,10 @@ def _warn_of_former_name(old: str, new: str) -> None:
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
-    """A settings dataclass from a mapping, nested ones from nested mappings; strict.
+    """Build a settings dataclass from a mapping, strictly; nested dataclasses from nested mappings.
 
     Raises:
-        ValueError: saying the key or the type that was expected, and what came.
+        ValueError: a key is unknown or a type wrong; the message says what was expected and what was given.
     """
     defaults = cls()
     values: dict[str, Any] = {}
@@ -84,21 +84,23 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
 
 
 def check_range(name: str, value: float, least: float, most: float) -> None:
-    """Raises:
-    ValueError: it is not between them.
+    """Check that a value lies in a range.
+
+    Raises:
+        ValueError: it does not.
     """
     if not least <= value <= most:
         raise ValueError(f"{name}: expected {least:g} to {most:g}, got {value:g}")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """The end of an error's sentence: the known name that was probably meant, if there is one."""
+    """Return the end of an error message, which suggests the most similar known name, if there is one."""
     close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
     return f", did you mean {close[0]!r}?" if close else ""
 
 
 def _kind_of_items(cls: type, key: str) -> type | None:
-    """The kind of numbers that a list, or the values of a table, holds, as the dataclass says; None if of none."""
+    """Return the annotated type of the numbers in a list or in a table's values; None if it is not int or float."""
     kinds = get_args(get_type_hints(cls)[key])
     return kinds[-1] if kinds and kinds[-1] in (int, float) else None
 

@@ -1,11 +1,11 @@
-"""Networks of graph layers as live nodes run them: two kinds of steps on matrices.
+"""Live inference of graph networks without torch: compiled loops over two kinds of matrix steps.
 
-Networks of this size are all overhead in torch: 250 small operations take ten times as long as their arithmetic. Here
-one is recorded once (`Program`) as a list of steps, which compiled loops run (`Network`).
+In torch, overhead dominates networks of this size: 250 small operations take ten times as long as their arithmetic.
+Here, a network is recorded once as a list of steps (`Program`), and compiled loops run it (`Network`).
 
-Each step runs for one window after the other: a window's matrices of 66 nodes fit into the L1 cache, where products
-take half as long per window as those of eight windows side by side, and a step's weights are still cached for the next
-window. So a window's results do not depend on the others, bit for bit.
+Each step processes one window after the other. A window's matrices of 66 nodes fit into the L1 cache, where a product
+takes half as long per window as for eight windows side by side, and the step's weights are still cached for the next
+window. The results of a window therefore do not depend on other windows, bit for bit.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, part
 
 LOG_VAR_RANGE = (-10.0, 3.0)
-"""Range of log-variances, in units of `prior.models.hgvae.config.SCALE`: standard deviations from 1.3 mm to 0.9 m."""
+"""Range of log-variances, in units of `prior.models.hgvae.config.SCALE`; standard deviations are 1.3 mm to 0.9 m."""
 
-# Steps: the kind, the matrix written, that read, and what else the kind needs (see `_do`).
+# Steps: the kind, the matrix written, the matrix read, and further fields by kind (see `_do`).
 _LINEAR, _GELU = range(2)
 _FIELDS = 8
 _NONE = -1
 
 _SMALL = 1_000_000
-"""Products up to which OpenBLAS multiplies matrices as they are. Beyond, it rearranges them first, which takes three
-times as long as the rest where there are but ten rows."""
+"""Largest number of products in a matrix multiplication for which OpenBLAS does not repack the matrices. Repacking
+takes three times as long as the multiplication itself if there are only ten rows."""
 
 _LINE = 16
-"""Numbers in a line of the cache. Matrices begin with one: products of those that do not take a seventh longer."""
+"""Number of floats in a cache line. Matrices are aligned to it; unaligned products take a seventh longer."""
 
 
 class Program:
-    """A network as a list of steps, which may overwrite a matrix, with the shapes of the matrices, and all weights."""
+    """A network as a list of steps, with the shapes of its matrices and all weights. Steps may overwrite matrices."""
 
     def __init__(self) -> None:
         self.steps: list[list[int]] = []
@@ -44,7 +44,7 @@ class Program:
         self._used = 0
 
     def matrix(self, nodes: int, features: int) -> int:
-        """A new matrix's number; zero where no step writes it."""
+        """Add a matrix and return its number. It is zero unless a step writes it."""
         self.shapes.append((nodes, features))
         return len(self.shapes) - 1
 
@@ -68,13 +68,13 @@ class Program:
         onto: int = _NONE,
         active: bool = False,
     ) -> int:
-        """``adjacency @ of @ weight + bias + plus``; without an adjacency, nodes stay by themselves.
+        """Add the step ``adjacency @ of @ weight + bias + plus``. Without an adjacency, nodes are not mixed.
 
         Args:
             of, weight, bias, adjacency: (n_in, f_in), (f_in, f_out), (f_out) or (n_out, f_out), (n_out, n_in).
             plus: matrix to add.
-            onto: matrix to write; a new one if left out.
-            active: whether ``of`` goes through a GELU first.
+            onto: matrix to write; a new one if omitted.
+            active: whether to apply a GELU to ``of`` first.
         """
         nodes = self.shapes[of][0] if adjacency is None else len(adjacency)
         out = self.matrix(nodes, weight.shape[1]) if onto == _NONE else onto
@@ -83,13 +83,13 @@ class Program:
         return self._step(_LINEAR, out, of, self._store(weight), shift, stored, plus, int(active))
 
     def layer(self, of: int, layer: Arrays, *, plus: int = _NONE, onto: int = _NONE, active: bool = False) -> int:
-        """The weights of a `GraphLinear`; of none, ``of`` itself: the same nodes need no layer between them."""
+        """Add a `GraphLinear` with these weights. Without weights, return ``of``: equal nodes need no layer between."""
         if not layer:
             return of
         return self.linear(of, layer["weight"], layer["bias"], layer["adjacency"], plus, onto, active)
 
     def block(self, of: int, block: Arrays, *, onto: int) -> int:
-        """A graph convolutional block, equation 5, written to ``onto``, which may be ``of`` itself.
+        """Add a graph convolutional block (equation 5), written to ``onto``, which may be ``of``.
 
         Args:
             of: matrix read.
@@ -100,7 +100,7 @@ class Program:
         return self._step(_GELU, onto, inner, self._store(block["alpha"]), of)
 
     def trunk(self, of: int, weights: Arrays) -> int:
-        """A network's ``read`` with its GELU, and its ``blocks`` one after the other."""
+        """Add a network's ``read`` layer with its GELU, followed by its ``blocks``."""
         graph = self.gelu(self.layer(of, part(weights, "read")))
         blocks, k = part(weights, "blocks"), 0
         while block := part(blocks, str(k)):
@@ -109,16 +109,16 @@ class Program:
         return graph
 
     def gelu(self, of: int) -> int:
-        """GELU of a matrix, into a matrix of its own."""
+        """Add a GELU of a matrix, written to a new matrix."""
         return self._step(_GELU, self.matrix(*self.shapes[of]), of, self._store(np.ones(1, dtype=np.float32)), _NONE)
 
 
 class Network:
-    """A program with room for what it computes.
+    """A program with memory for its matrices.
 
     Args:
-        program: a network written down; later changes to it are not seen here.
-        max_batch: windows at once, each in its row.
+        program: the recorded network; later changes to it have no effect.
+        max_batch: largest number of windows, each in its row.
     """
 
     def __init__(self, program: Program, max_batch: int) -> None:
@@ -133,16 +133,16 @@ class Network:
         self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
 
     def matrix(self, number: int, rows: slice) -> Floats32:
-        """(B, n, f) one matrix of the windows in these rows; a view."""
+        """(B, n, f) view of one matrix of the windows in these rows."""
         return self._values[rows, self._starts[number] : self._ends[number]].reshape(-1, *self._shapes[number])
 
     def run(self, rows: slice) -> None:
-        """Do all steps for the windows in these rows."""
+        """Run all steps for the windows in these rows."""
         _forward(self._steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch)
 
 
 def _zeros(*shape: int) -> Floats32:
-    """Zeros in memory that begins with a line of the cache."""
+    """Return zeros in memory that is aligned to a cache line."""
     size = math.prod(shape)
     room = np.zeros(size + _LINE, dtype=np.float32)
     first = -(room.ctypes.data // room.itemsize) % _LINE
@@ -150,9 +150,9 @@ def _zeros(*shape: int) -> Floats32:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# The steps, compiled. The types of all arguments are those of Network's attributes.
+# Compiled steps. All arguments have the types of Network's attributes.
 
-# Abramowitz and Stegun 7.1.28: erf within 3e-7 without an exponential, which compilers turn into vector instructions.
+# Abramowitz and Stegun 7.1.28: erf within 3e-7. It needs no exponential, so compilers vectorise it.
 _ERF = tuple(
     np.array([0.0705230784, 0.0422820123, 0.0092705272, 0.0001520143, 0.0002765672, 0.0000430638], dtype=np.float32)
 )
@@ -162,7 +162,7 @@ _ONE = np.float32(1)
 
 @njit(cache=True, fastmath=True)
 def _gelu(values, out):
-    """``x * Phi(x)`` of a row, Phi being the normal distribution's."""
+    """Write ``x * Phi(x)`` of a row, with Phi the normal distribution function."""
     half, one = np.float32(0.5), np.float32(1)
     a, b, c, d, e, f = _ERF
     for k in range(len(values)):
@@ -183,7 +183,7 @@ def _add(values, factor, out):
 
 @njit(cache=True, fastmath=True)
 def _copy(values, out):
-    """What ``out[:] = values`` does, in a tenth of the time."""
+    """Do ``out[:] = values`` in a tenth of the time."""
     for k in range(len(values)):
         out[k] = values[k]
 
@@ -196,13 +196,13 @@ def _view(arena, shapes, starts, number):
 
 @njit(cache=True)
 def _mix_first(nodes_in, features_in, nodes, features):
-    """Whether ``(S a) W`` costs less than ``S (a W)``."""
+    """Whether ``(S a) W`` takes fewer operations than ``S (a W)``."""
     return nodes * features_in * (nodes_in + features) < nodes_in * features * (features_in + nodes)
 
 
 @njit(cache=True)
 def _multiply(a, weight, product):
-    """Writes ``a @ weight``, in parts small enough for those of BLAS's kernels that do not rearrange matrices first."""
+    """Write ``a @ weight``, in parts small enough for BLAS kernels that do not repack matrices."""
     rows, inner = a.shape
     parts = -(-rows * inner * weight.shape[1] // _SMALL)
     if parts == 1:
@@ -217,7 +217,7 @@ def _multiply(a, weight, product):
 
 @njit(cache=True)
 def _forward(steps, shapes, starts, weights, windows, scratch):
-    """Do the steps for windows (B, all matrices)."""
+    """Run the steps for windows (B, all matrices)."""
     for k in range(len(steps)):
         for row in range(len(windows)):
             _do(steps[k], shapes, starts, weights, windows[row], scratch)

@@ -1,4 +1,4 @@
-"""`Completer` without torch: one pass over windows, and the motion that it corrects."""
+"""Live inference of `Completer` without torch: one pass over windows, applied to the interpolated motion."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LiveCompleter:
 
     Attributes:
         config: its sizes.
-        usual: (22, 4) quaternions, xyzw, local, of the mean pose: for joints that are never known.
+        usual: (22, 4) local quaternions, xyzw, of the mean pose, used for joints that are never known.
     """
 
     def __init__(self, config: CompleterConfig, weights: Arrays) -> None:
@@ -35,19 +35,19 @@ class LiveCompleter:
 
     @classmethod
     def load(cls, weights: str) -> LiveCompleter:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         arrays, config = load_weights(weights, "completer")
         return cls(CompleterConfig.from_dict(config), arrays)
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """Complete windows; what is known stays.
+        """Complete windows. Known joints do not change.
 
         Args:
-            positions: (B, T, 22, 3) metres, z up; NaN where not known.
+            positions: (B, T, 22, 3) metres, z up; NaN where unknown.
             offsets: (B, 22, 3) metres, the person's bones.
 
         Returns:
-            local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres.
+            Local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres.
         """
         window = read_window(positions, offsets, self.usual)
         output = self.forward(window.features).astype(np.float64)
@@ -94,6 +94,6 @@ def _norm(x: Floats32, layer: Arrays) -> Floats32:
 
 
 def _gelu(x: Floats32) -> Floats32:
-    """GELU, by its approximation with tanh."""
+    """GELU in its tanh approximation."""
     inner = np.float32(math.sqrt(2.0 / math.pi)) * (x + np.float32(0.044715) * x * x * x)
     return np.float32(0.5) * x * (np.float32(1.0) + np.tanh(inner))

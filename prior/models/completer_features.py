@@ -1,9 +1,10 @@
-"""Sizes and features of the completer, and the interpolation that it corrects, in training and live alike.
+"""Sizes and features of the completer, and the interpolation that it corrects. Training and live inference share them.
 
-The line: rotations by slerp and root by lerp between what is known before and after, joint by joint. What is known on
-one side only is held, what is never known has the mean pose. The bend: a cubic with the velocities at both ends, less
-the line; the network's output has a gate for it. The correction: the rest of that output, less the line through it
-(`anchored`), so that it vanishes where something is known and there is no step.
+The estimate is the sum of three parts. The *line* interpolates each joint between its known frames, rotations by slerp
+and the root by lerp. A joint that is known on one side only is held; a joint that is never known has the mean pose. The
+*bend* is a cubic with the velocities at both ends, minus the line; the network outputs a gate for it. The *correction*
+is the rest of the network's output, minus the line through its values at known frames (`anchored`). It vanishes at
+known frames, so there is no step.
 """
 
 from __future__ import annotations
@@ -25,24 +26,24 @@ from steadypose.prior.timing.rate import FPS
 JOINTS = 22
 
 BENDS = JOINTS * 6 + 3
-"""Numbers of a frame's bend: of each rotation's first two columns, and of the root's position."""
+"""Number of values in a frame's bend: first two columns of each rotation, and the root's position."""
 
 FEATURES = JOINTS * (6 + 3 + 3 + 3) + 9 + BENDS
-"""Numbers of a frame: of each joint its rotation (6D), position, velocity, whether it is known, and how near that is
-before and after; of the root its position, velocity and the same three; and the bend."""
+"""Number of features of a frame: each joint's rotation (6D), position, velocity, known flag, and nearness of the last
+and next known frame; the root's position, velocity, flag and nearness; and the bend."""
 
 OUTPUTS = JOINTS * 6 + 3 + JOINTS + 1
-"""Corrections of each joint's 6D rotation and of the root's position, metres; and logits of the gates of each joint's
-and the root's bend."""
+"""Number of outputs of a frame: corrections of each joint's 6D rotation and of the root's position (metres), and logits
+of the gates of each joint's and the root's bend."""
 
 NEAR = 8.0
-"""Frames from something known at which its nearness is a half: 1 / (1 + d / NEAR)."""
+"""Distance from a known frame at which the nearness 1 / (1 + d / NEAR) is one half, frames."""
 
 SHORT_SHARE, LONG_SHARE, LONG_GAP = 0.2, 0.75, 30.0
-"""Shares of the correction that are taken in gaps of 0 frames, and of `LONG_GAP` frames and more."""
+"""Shares of the correction that are applied in gaps of 0 frames, and of at least `LONG_GAP` frames."""
 
 MAX_BEND = 2.0
-"""Bound of a bend's entries: of rotation matrices, and metres."""
+"""Bound of a bend's entries: entries of rotation matrices, and metres."""
 
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]
@@ -54,12 +55,12 @@ class CompleterConfig:
     """The sizes of the completer.
 
     Attributes:
-        width: of the transformer's tokens, one a frame.
-        heads: of each layer's attention.
-        layers: how many.
+        width: width of the transformer's tokens, one per frame.
+        heads: number of attention heads of each layer.
+        layers: number of layers.
         reach: frames at which relative positions are clipped.
-        never_sigma: (22,) metres along an axis, error of each joint where it is never known, of validation people.
-        half_frames: frames from the nearest in which a joint is known at which its error is half of that.
+        never_sigma: (22,) metres along an axis, error of each joint if it is never known (validation people).
+        half_frames: frames from a joint's nearest known frame at which its error is half of `never_sigma`.
     """
 
     width: int = 128
@@ -71,7 +72,7 @@ class CompleterConfig:
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> CompleterConfig:
-        """From the JSON of a weights file."""
+        """Build the configuration from the JSON of a weights file."""
         return cls(**{**config, "never_sigma": tuple(config["never_sigma"])})
 
 
@@ -79,11 +80,11 @@ class Line(NamedTuple):
     """Interpolation of each track of B windows: 22 rotations and, last, the root's position.
 
     Attributes:
-        before: (B, T, 23) the last known frame; the next, if there is none before.
-        after: (B, T, 23) the next known frame; the last, if there is none after.
-        weight: (B, T, 23) float32, 0 to 1, from the one to the other.
-        known: (B, T, 23) whether this frame itself is.
-        ever: (B, 23) whether any is.
+        before: (B, T, 23) index of the last known frame; of the next one if there is none before.
+        after: (B, T, 23) index of the next known frame; of the last one if there is none after.
+        weight: (B, T, 23) float32, interpolation weight from 0 (before) to 1 (after).
+        known: (B, T, 23) whether the frame itself is known.
+        ever: (B, 23) whether any frame is known.
     """
 
     before: NDArray[np.int64]
@@ -94,17 +95,18 @@ class Line(NamedTuple):
 
 
 class Window(NamedTuple):
-    """Input of the completer for B windows, each turned and moved: the first known root faces +x at the origin.
+    """Input of the completer for B windows, each transformed so that the first known root is at the origin and faces
+    +x.
 
     Attributes:
         features: (B, T, FEATURES) float32.
-        rotations: (B, T, 22, 3, 3) local, the line's.
-        root: (B, T, 3) metres, the line's.
-        bend: (B, T, 23, 6) cubics less the line: of the rotations' first two columns; of the root, last, three
-            metres and three zeros.
+        rotations: (B, T, 22, 3, 3) local rotations of the line.
+        root: (B, T, 3) metres, root positions of the line.
+        bend: (B, T, 23, 6) cubics minus the line: of the rotations' first two columns and, last, of the root (three
+            values in metres and three zeros).
         line: the interpolation.
         turn: (B, 3, 3) rotations from the window's frame to the world.
-        origin: (B, 3) metres, world, of the window's frame.
+        origin: (B, 3) metres, world, origin of the window's frame.
     """
 
     features: Floats32
@@ -117,13 +119,13 @@ class Window(NamedTuple):
 
 
 def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple[Floats, Bools]:
-    """Local rotations (..., 22, 3, 3), NaN where undetermined, and which (..., 22) are known.
+    """Solve local rotations (..., 22, 3, 3), NaN where undetermined; also returns which (..., 22) are known.
 
-    A rotation is known where its joint and the one below are and that of the joint above is. A chest that hangs from a
-    spine was not seen, as with sensors without a spine, is known: the spine then has the mean pose.
+    A rotation is known if its joint, the joint below and the rotation above are known. If only the spine between is
+    unobserved, as with sensors without one, the chest counts as known, and the spine has the mean pose.
 
     Args:
-        positions: (..., 22, 3) metres, z up; NaN where not known.
+        positions: (..., 22, 3) metres, z up; NaN where unknown.
         offsets: (..., 22, 3) metres, bones.
         usual: (22, 3, 3) local rotations of the mean pose.
     """
@@ -147,12 +149,12 @@ def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple
 
 
 def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
-    """The completer's input of windows.
+    """Build the completer's input from windows.
 
     Args:
-        positions: (B, T, 22, 3) metres, z up; NaN where not known.
+        positions: (B, T, 22, 3) metres, z up; NaN where unknown.
         offsets: (B, 22, 3) metres, the person's bones.
-        usual: (22, 4) quaternions, xyzw, local, of the mean pose.
+        usual: (22, 4) local quaternions, xyzw, of the mean pose.
     """
     count, frames = positions.shape[:2]
     known = finite_joints(positions)
@@ -187,7 +189,7 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
 
 
 def draw_line(known: Bools) -> Line:
-    """The line of K tracks, by where each is known (B, T, K)."""
+    """Build the line of K tracks from the frames in which each is ``known`` (B, T, K)."""
     shape = known.shape
     before, after = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     weight = np.zeros(shape, dtype=np.float32)
@@ -196,15 +198,17 @@ def draw_line(known: Bools) -> Line:
 
 
 def correction_share(line: Line) -> Floats32:
-    """(B, T, 23, 1) share of the network's output that is taken beside the cubic: by validation less in shorter gaps,
-    all of it where a track is known on one side only or never."""
+    """(B, T, 23, 1) share of the correction that is applied in addition to the cubic.
+
+    It is smaller in shorter gaps (chosen on validation), and 1 if a track is known on one side only or never.
+    """
     length = (line.after - line.before)[..., None].astype(np.float32)
     between = SHORT_SHARE + (LONG_SHARE - SHORT_SHARE) * np.minimum(length / LONG_GAP, 1.0)
     return np.where(length > 0, between, 1.0).astype(np.float32)
 
 
 def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
-    """(B, T, K, d) values at known frames, interpolated along the line; 0 of tracks never known."""
+    """(B, T, K, d) values interpolated along the line between known frames; 0 for tracks that are never known."""
     first = np.take_along_axis(values, line.before[..., tracks, None], axis=1)
     second = np.take_along_axis(values, line.after[..., tracks, None], axis=1)
     weight = line.weight[..., tracks, None]
@@ -212,12 +216,12 @@ def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
 
 
 def anchored(values: Floats, line: Line, tracks: slice) -> Floats:
-    """A network's output (B, T, K, d) for these tracks, less the line through its values where they are known."""
+    """Subtract from a network's output (B, T, K, d) for these tracks the line through its values at known frames."""
     return values - _lerp(values, line, tracks)
 
 
 def rotations_of_6d(x: Floats) -> Floats:
-    """Rotations (..., 3, 3) of their first two columns (..., 6), by Gram and Schmidt (Zhou et al. 2019)."""
+    """Convert first two columns (..., 6) to rotations (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
     first = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
     second = x[..., 3:] - (first * x[..., 3:]).sum(axis=-1, keepdims=True) * first
     second /= np.linalg.norm(second, axis=-1, keepdims=True)
@@ -253,7 +257,7 @@ def _neighbours(known, before, after, weight):
 
 @njit(cache=True)
 def _bends(values, known, before, after, weight, out):
-    """Hermite's cubic less the line. At an end of which no velocity is known the cubic is straight."""
+    """Write the Hermite cubic minus the line. At an end without a known velocity, the cubic is straight."""
     count, frames, tracks, size = values.shape
     for row in range(count):
         for t in range(frames):
@@ -268,7 +272,7 @@ def _bends(values, known, before, after, weight, out):
                     continue
                 for i in range(size):
                     p, q = values[row, a, k, i], values[row, b, k, i]
-                    way, start, end = q - p, 0.0, 0.0  # velocities times the gap's length, less the way
+                    way, start, end = q - p, 0.0, 0.0  # velocities times the gap's length, minus the displacement
                     if left:
                         start = p - values[row, a - 1, k, i]
                         if a > 1 and known[row, a - 2, k]:

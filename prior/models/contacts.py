@@ -1,4 +1,4 @@
-"""The contact network as the live node runs it, without torch, and its features, which training shares."""
+"""Live inference of the contact network without torch, and its features, which training shares."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from steadypose.prior.models.recurrent import LiveRecurrent, sigmoid
 from steadypose.prior.models.weights import Arrays, load_weights
 
 OF_JOINT = 12
-"""Features of a joint: from the root (3), velocity against the root (3), height, velocity (3), deviation, known."""
+"""Number of features of a joint: position (3) and velocity (3) relative to the root, height, velocity (3), standard
+deviation, known flag."""
 
 OF_BODY = 2
-"""Whether the root is seen and whether the ground is known."""
+"""Number of features of a body: whether the root is observed, and whether the ground is known."""
 
 FEATURES = OF_JOINT * len(CONTACT_JOINTS) + OF_BODY
-"""Numbers of a frame."""
+"""Number of features of a frame."""
 
 FROM_ROOT, FASTEST = 0.5, 3.0
-"""Metres and m/s by which places and velocities are divided, and m/s at which velocities are clipped."""
+"""Unit of positions, metres, and unit and clipping bound of velocities, m/s."""
 
 HEIGHT, HIGHEST = 0.1, 0.6
-"""Metres by which heights are divided, and at which they are clipped."""
+"""Unit and clipping bound of heights, metres."""
 
 SIGMA, MIN_SIGMA, MAX_SIGMA = 0.01, 1e-3, 1.0
-"""Metres: the deviation whose logarithm is 0, and those at which it is clipped."""
+"""Unit and range of standard deviations, which enter by their logarithm, metres."""
 
 _JOINTS = list(CONTACT_JOINTS)
 
@@ -43,16 +44,16 @@ def contact_features(
     root_seen: Floats,
     ground: Floats,
 ) -> NDArray[np.float32]:
-    """(B, `FEATURES`) of B frames.
+    """Build the features (B, `FEATURES`) of B frames.
 
     Args:
-        positions: (B, 22, 3) metres, world; NaN of joints that are not known: of a hidden root, say.
-        before: (B, 22, 3) the same of the frame before.
-        dt: (B,) or a number, seconds between them.
-        yaw: (B,) radians, where the body looks.
+        positions: (B, 22, 3) metres, world; NaN for unknown joints, such as a hidden root.
+        before: (B, 22, 3) metres, positions in the frame before.
+        dt: (B,) or a number, seconds between the two frames.
+        yaw: (B,) radians, heading of the body.
         sigma: (B, 22) metres, standard deviations.
-        root_seen: (B,) 1 where both frames are where they are seen in the world, 0 where only against the root.
-        ground: (B, 8) metres, world, the height of the ground under each of `CONTACT_JOINTS`; NaN where not known.
+        root_seen: (B,) 1 if both frames have world positions, 0 if only positions relative to the root.
+        ground: (B, 8) metres, world, height of the ground under each of `CONTACT_JOINTS`; NaN where unknown.
     """
     joints, joints_before = positions[:, _JOINTS], before[:, _JOINTS]
     known = finite_joints(joints) & finite_joints(joints_before)
@@ -79,12 +80,12 @@ def contact_features(
 
 
 class Contacts(NamedTuple):
-    """Of B bodies and `CONTACT_JOINTS`.
+    """Contacts of B bodies at `CONTACT_JOINTS`.
 
     Attributes:
-        load: (B, 8) probabilities that they bear load.
-        rest: (B, 8) that they stand still on what bears them.
-        state: (B, hidden) what to remember for the next frame.
+        load: (B, 8) probabilities that the joints bear load.
+        rest: (B, 8) probabilities that the joints rest on their support.
+        state: (B, hidden) hidden state for the next frame.
     """
 
     load: Floats32
@@ -96,7 +97,7 @@ class LiveContacts:
     """A trained `ContactNet`.
 
     Attributes:
-        hidden: numbers that it remembers of a body; zeros before the first frame.
+        hidden: size of a body's hidden state, which is zero before the first frame.
     """
 
     def __init__(self, weights: Arrays) -> None:
@@ -105,11 +106,11 @@ class LiveContacts:
 
     @classmethod
     def load(cls, weights: str) -> LiveContacts:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         return cls(load_weights(weights, "contacts")[0])
 
     def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> Contacts:
-        """One frame: features (B, `FEATURES`) and what was remembered, (B, `hidden`)."""
+        """Process one frame: features (B, `FEATURES`) and hidden states (B, `hidden`)."""
         outputs, state = self._net(features, state)
         predicted = sigmoid(outputs)
         return Contacts(predicted[:, : len(CONTACT_JOINTS)], predicted[:, len(CONTACT_JOINTS) :], state)

@@ -1,9 +1,9 @@
-"""HM-VAE as the live node runs it: windows through the posterior's mean and the decoder, nothing else.
+"""Live inference of HM-VAE: windows through the posterior's mean and the decoder.
 
-The same numbers as `HMVAE.reconstruct`, at a fifth of the cost. For one body it is the weights' way from memory that
-takes the time, so all that is linear is folded once: pooling and unpooling into the convolutions; taps that see the
-same frames, the window's ends being reflected, into one; and what follows a latent up to the next activation into one
-product, which reads the latent's six numbers an edge instead of the features made of them. Features are (B, T, E * C).
+The results equal those of `HMVAE.reconstruct`, at a fifth of the cost. For one body, reading weights from memory
+dominates, so linear operations are folded once. Pooling and unpooling are folded into the convolutions. Taps that see
+the same frames, because the window's ends are reflected, become one. All operations from a latent up to the next
+activation become one product, which reads the latent's six numbers per edge. Features are (B, T, E * C).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_ma
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 ROTATION_FEATURES = 6
-"""A joint's features: the first two columns of its local rotation."""
+"""Number of features of a joint: the first two columns of its local rotation."""
 
 CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
-"""Channels of an edge, before the first block of the encoder and after each."""
+"""Channels of an edge, before the encoder's first block and after each block."""
 
 DEVIATION = 0.1
-"""Of a joint's features from those of its mean over a window, typically: the network has deviations in this unit."""
+"""Unit of a joint's deviations from its mean over a window: their typical size."""
 
 NO_ROTATION = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""A joint's features where it does not deviate from its mean."""
+"""Features of a joint that does not deviate from its mean."""
 _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 
 
@@ -38,14 +38,14 @@ class HMVAEConfig:
     """Sizes of an HM-VAE.
 
     Attributes:
-        window: frames T.
-        kernel: time steps a convolution sees (official: 3 for T = 8, 15 for T = 64).
-        strides: of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
-        local_latent: dimensions of z_l an edge (official: 6; 12).
-        global_latent: dimensions of z_g an edge (official: 6; 24).
-        about_mean: whether each joint's rotations are encoded and decoded in the frame of their mean over the window,
-            which is observed, rather than, as the paper's, as they are: what is left to tell is how the window moves,
-            where the paper's error is mostly constant over it. The encoder sees the mean pose too.
+        window: T, frames of a window.
+        kernel: time steps of a convolution (official: 3 for T = 8, 15 for T = 64).
+        strides: strides of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
+        local_latent: dimensions of z_l per edge (official: 6; 12).
+        global_latent: dimensions of z_g per edge (official: 6; 24).
+        about_mean: whether each joint's rotations are encoded and decoded in the frame of their observed mean over the
+            window. The paper encodes the rotations themselves, and its error is mostly constant over the window. With
+            the mean given, only the motion within the window has to be encoded. The encoder also sees the mean pose.
     """
 
     window: int = 8
@@ -57,20 +57,20 @@ class HMVAEConfig:
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:
-        """From the JSON of a weights file."""
+        """Build the configuration from the JSON of a weights file."""
         return cls(**{**config, "strides": tuple(config["strides"])})
 
     @property
     def features(self) -> int:
-        """Features of a joint that the encoder sees: its rotation, or its deviation from the mean and the mean."""
+        """Number of the encoder's features of a joint: its rotation, or its deviation from the mean and the mean."""
         return ROTATION_FEATURES * (2 if self.about_mean else 1)
 
     @property
     def steps(self) -> list[int]:
-        """Frames before the first block of the encoder and after each.
+        """Frames before the encoder's first block and after each block.
 
         Raises:
-            ValueError: the window cannot be strided so.
+            ValueError: the strides do not divide the window.
         """
         steps = [self.window]
         for stride in self.strides:
@@ -81,7 +81,7 @@ class HMVAEConfig:
 
 
 class LiveHMVAE:
-    """A trained `HMVAE`'s reconstruction.
+    """Reconstruction by a trained `HMVAE`.
 
     Args:
         config: its sizes.
@@ -109,15 +109,13 @@ class LiveHMVAE:
             )
             decoder.append((weight, conv.get("bias", none), stretch))
         (last, last_bias, last_stretch), *_, first = decoder
-        stream = last.reshape(len(last), edges[0], 2, -1, last.shape[-1])[
-            :, :, 0
-        ]  # of each edge, the stream's channels
+        stream = last.reshape(len(last), edges[0], 2, -1, last.shape[-1])[:, :, 0]  # the stream's channels of each edge
         decoder[0] = stream.reshape(len(last), -1, last.shape[-1]), none, last_stretch  # the bias comes with z_l
 
         def from_deep(latent: Floats32) -> Floats32:
             return _TemporalLinear(*first)(_expanded(latent, part(weights, "from_global"), steps[4]))
 
-        def from_local(latent: Floats32) -> Floats32:  # beside a stream of zeros
+        def from_local(latent: Floats32) -> Floats32:  # with a stream of zeros
             features = _expanded(latent, part(weights, "from_local"), steps[1])
             features = features.reshape(*features.shape[:2], edges[0], -1)
             joined = np.concatenate([np.zeros_like(features), features], axis=-1)
@@ -129,7 +127,7 @@ class LiveHMVAE:
 
     @classmethod
     def load(cls, weights: str) -> LiveHMVAE:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         arrays, config = load_weights(weights, "hmvae")
         return cls(HMVAEConfig.from_dict(config), arrays)
 
@@ -155,7 +153,7 @@ class LiveHMVAE:
 
 
 def _rotations(x: Floats32) -> Floats32:
-    """(..., 3, 3) of the first two columns (..., 6), by Gram and Schmidt."""
+    """(..., 3, 3) rotations from first two columns (..., 6), by Gram-Schmidt."""
     first, second = x[..., :3], x[..., 3:]
     first = first / np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
     second = second - (first * second).sum(axis=-1, keepdims=True) * first
@@ -164,7 +162,7 @@ def _rotations(x: Floats32) -> Floats32:
 
 
 def _mean_pose(x: Floats32) -> Floats32:
-    """(B, 1, 22, 3, 3) local rotations: the mean of bones' orientations in windows x (B, T, 22, 6)."""
+    """(B, 1, 22, 3, 3) local rotations of the mean of bones' orientations in windows x (B, T, 22, 6)."""
     local = _rotations(x)
     orientations = local.copy()
     for joint, parent in enumerate(PARENTS[1:], start=1):
@@ -181,18 +179,18 @@ def _first_two(rotations: Floats32) -> Floats32:
 
 
 def _columns(x: Floats32, frame: Floats32) -> Floats32:
-    """The two columns in x (..., 6), which are vectors, in these frames (..., 3, 3)."""
+    """Express the two column vectors in x (..., 6) in these frames (..., 3, 3)."""
     return (x.reshape(*x.shape[:-1], 2, 3) @ frame).reshape(x.shape)
 
 
 class _TemporalLinear:
-    """A convolution as two products: ``over_time`` (T' * taps, T) gathers each output frame's inputs.
+    """A convolution as two products. ``over_time`` (T' * taps, T) gathers the inputs of each output frame.
 
     Args:
         weight: (out, in, kernel)
         bias: (out,) or (1,)
-        stretch: (T', T) what is done over time before; its ends are reflected.
-        stride: in time.
+        stretch: (T', T) preceding linear operation over time; its ends are reflected.
+        stride: stride in time.
     """
 
     def __init__(self, weight: Floats32, bias: Floats32, stretch: Floats32, stride: int = 1) -> None:
@@ -207,16 +205,16 @@ class _TemporalLinear:
         self._weight, self._bias = merged.reshape(len(merged), -1), bias
 
     def __call__(self, x: Floats32) -> Floats32:
-        """(B, T, in) to (B, T', out)."""
+        """Map (B, T, in) to (B, T', out)."""
         windows = (self._over_time @ x).reshape(-1, self._weight.shape[1])
         return dense(windows, self._weight, self._bias).reshape(len(x), -1, len(self._weight))
 
 
 class _Latent:
-    """A latent's mean, edge by edge: (B, T, E * C) to (B, E * latent)."""
+    """Mean of a latent, edge by edge: (B, T, E * C) to (B, E * latent)."""
 
     def __init__(self, linear: Arrays, latent: int, channels: int) -> None:
-        # The model's features are (C, T) within an edge, these are (T, C).
+        # the model's features are (C, T) within an edge, these are (T, C)
         weight = linear["weight"][:latent].reshape(latent, channels, -1).swapaxes(1, 2)
         self._channels, self._weight = channels, weight.reshape(latent, -1)
         self._bias = linear["bias"][:latent]
@@ -227,10 +225,10 @@ class _Latent:
 
 
 class _Affine:
-    """What becomes of a latent, as one product: (B, E * latent) to (B, T, out).
+    """An affine function of a latent, folded into one product: (B, E * latent) to (B, T, out).
 
     Args:
-        function: affine, (B, E, latent) to (B, T, out).
+        function: the affine function, (B, E, latent) to (B, T, out).
     """
 
     def __init__(self, function: Callable[[Floats32], Floats32], edges: int, latent: int) -> None:
@@ -246,20 +244,20 @@ class _Affine:
 
 
 def _unpooled(weight: Floats32, unpool: Floats32) -> Floats32:
-    """(out, pooled in, kernel): a convolution's weight with the unpooling before it."""
+    """(out, pooled in, kernel) weight of a convolution, with the preceding unpooling folded in."""
     outputs, _, kernel = weight.shape
     edges = weight.reshape(outputs, len(unpool), -1, kernel)
     return np.einsum("oeck,eg->ogck", edges, unpool).reshape(outputs, -1, kernel)
 
 
 def _expanded(latent: Floats32, linear: Arrays, steps: int) -> Floats32:
-    """(B, T, E * C) features of a latent (B, E, d), edge by edge."""
+    """(B, T, E * C) features from a latent (B, E, d), edge by edge."""
     features = latent @ linear["weight"].T + linear["bias"]
     features = features.reshape(*latent.shape[:2], -1, steps)  # (C, T) within an edge
     return features.transpose(0, 3, 1, 2).reshape(len(latent), steps, -1)
 
 
 def _stretch(steps: int, factor: int) -> Floats32:
-    """(steps * factor, steps): linear interpolation over time, as `torch.nn.functional.interpolate` does it."""
+    """(steps * factor, steps) matrix of linear interpolation over time, equal to `torch.nn.functional.interpolate`."""
     places = np.maximum((np.arange(steps * factor) + 0.5) / factor - 0.5, 0.0)
     return np.maximum(1.0 - np.abs(np.minimum(places, steps - 1)[:, None] - np.arange(steps)), 0.0).astype(np.float32)

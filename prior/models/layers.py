@@ -1,6 +1,6 @@
-"""Layers that live networks share: products with an activation, and pooling over the edges of a skeleton.
+"""Layers that live networks share: dense products, activations, and pooling over the edges of a skeleton.
 
-An edge is the bone that ends in a joint and carries that joint's features; the root has a virtual edge of its own.
+An edge is the bone that ends in a joint, and it carries that joint's features. The root has a virtual edge.
 Neighbourhoods and pooling pairs are derived from the skeleton's graph (HM-VAE, section 3.1).
 """
 
@@ -15,7 +15,7 @@ from steadypose.prior.arrays import Floats32
 from steadypose.prior.compiled import njit
 
 FEW_ROWS = 2
-"""Products of so few take half the time without a BLAS, which copies the weights first."""
+"""Largest number of rows for which products without BLAS take half the time; BLAS copies the weights first."""
 
 SLOPE = 0.2
 """Slope of the LeakyReLU for negative values."""
@@ -32,7 +32,7 @@ def dense(x: Floats32, weight: Floats32, bias: Floats32) -> Floats32:
 
 @njit("(f4[:,::1], f4[:,::1], f4[:,::1])", cache=True, fastmath=True)
 def _few_rows(x, weight, out):
-    """Writes ``x @ weight.T``: (N, in) and (M, in) to (N, M)."""
+    """Write ``x @ weight.T``: (N, in) and (M, in) to (N, M)."""
     for j in range(len(weight)):
         for i in range(len(x)):
             total = np.float32(0)
@@ -42,18 +42,18 @@ def _few_rows(x, weight, out):
 
 
 def leaky_relu(x: Floats32) -> Floats32:
-    """With the slope `SLOPE`."""
+    """LeakyReLU with the slope `SLOPE`."""
     return np.maximum(x, np.float32(SLOPE) * x)
 
 
 @dataclass(frozen=True)
 class EdgeGraph:
-    """The edges of a skeleton as a tree: ``parents[e]`` is the edge towards the root, -1 for the root's own."""
+    """The edges of a skeleton as a tree. ``parents[e]`` is the edge towards the root, -1 for the root's own edge."""
 
     parents: tuple[int, ...]
 
     def neighbours(self, distance: int = 2) -> list[list[int]]:
-        """For each edge the edges within ``distance``, itself among them; edges that share a joint are 1 apart."""
+        """Return each edge's edges within ``distance``, including itself; edges that share a joint are 1 apart."""
         touching = [
             {o for o, q in enumerate(self.parents) if o != e and (q in (e, p) or o == p)}
             for e, p in enumerate(self.parents)
@@ -69,8 +69,8 @@ class EdgeGraph:
     def pool(self) -> tuple[EdgeGraph, list[list[int]]]:
         """Merge pairs of edges joined by a joint of degree two, walking each chain from the root's side.
 
-        A chain of odd length leaves its first edge alone, as the official code does; the virtual root edge is
-        never merged.
+        In a chain of odd length, the first edge is not merged, as in the official code. The virtual root edge is never
+        merged.
 
         Returns:
             The pooled graph, and for each of its edges the edges that it merges.
@@ -93,7 +93,7 @@ class EdgeGraph:
 
 @dataclass(frozen=True)
 class Level:
-    """One building block's place on the skeleton: who sees whom, and which edges merge after it."""
+    """The graph of one building block: the neighbours of each edge, and the edges that merge after the block."""
 
     graph: EdgeGraph
     neighbours: list[list[int]]
@@ -105,7 +105,7 @@ class Level:
 
 
 def pooling_levels(parents: Sequence[int], blocks: int = 4, distance: int = 2) -> list[Level]:
-    """The levels of an encoder of ``blocks`` blocks; once no chain is left to merge, pooling is the identity."""
+    """Return the levels of an encoder of ``blocks`` blocks. When no chain is left to merge, pooling is the identity."""
     graph = EdgeGraph(tuple(parents))
     levels = []
     for _ in range(blocks):
@@ -116,13 +116,13 @@ def pooling_levels(parents: Sequence[int], blocks: int = 4, distance: int = 2) -
 
 
 def pool_matrix(groups: Sequence[Sequence[int]]) -> Floats32:
-    """(len(groups), E): the mean over each group of edges."""
+    """(len(groups), E) matrix of the mean over each group of edges."""
     member = unpool_matrix(groups).T
     return np.ascontiguousarray(member / member.sum(axis=1, keepdims=True))
 
 
 def unpool_matrix(groups: Sequence[Sequence[int]]) -> Floats32:
-    """(E, len(groups)): each merged edge copied to the edges it came from."""
+    """(E, len(groups)) matrix that copies each merged edge to its original edges."""
     member = np.zeros((1 + max(max(g) for g in groups), len(groups)), dtype=np.float32)
     for k, group in enumerate(groups):
         member[list(group), k] = 1.0
@@ -130,5 +130,5 @@ def unpool_matrix(groups: Sequence[Sequence[int]]) -> Floats32:
 
 
 def mix_edges(mix: Floats32, features: Floats32) -> Floats32:
-    """All channels of edges (E * C, ...) mixed by (E', E): (E' * C, ...)."""
+    """Mix all channels of edges (E * C, ...) by a matrix (E', E), to (E' * C, ...)."""
     return (mix @ features.reshape(mix.shape[1], -1)).reshape(-1, *features.shape[1:])

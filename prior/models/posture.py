@@ -1,21 +1,21 @@
-"""Where joints are, given how all of them lie to each other: a Gaussian of the body in its trunk's frame.
+"""Posture prior: the positions of joints given each other, as a Gaussian of the whole body in the trunk's frame.
 
-Joints of a trunk are all but rigid to each other, and limbs lie by it as people hold them. What is known of a noisy
-joint is therefore the whole body's: of x ~ N(mean, S), seen as z = x + e with e ~ N(0, R), the expectation is
-z - R (S + R)^-1 (z - mean) and the covariance R - R (S + R)^-1 R (ridge regression whose ridge is the noise; Bishop
-2006, section 2.3.3). R is diagonal, each joint's own variance: a perfect joint stays, a hidden one follows the others.
-Then come the lengths of the person's bones.
+The joints of the trunk are almost rigid relative to each other, and limbs have typical postures. The whole body
+therefore informs a noisy joint. For x ~ N(mean, S), observed as z = x + e with e ~ N(0, R), the expectation is z - R (S
++ R)^-1 (z - mean) and the covariance is R - R (S + R)^-1 R. This is ridge regression with the noise as the ridge
+(Bishop 2006, section 2.3.3). R is diagonal and holds each joint's variance, so a noise-free joint does not move, and a
+hidden joint follows the others. After that, the person's bone lengths are imposed.
 
-The frame is that of hips and shoulders, as noisy as they are: S holds a turn and a shift of it, in which no posture is
-preferred. So a body may lie, or stand on its hands.
+The frame is spanned by the noisy hips and shoulders. S therefore includes a rotation and a translation of the frame, in
+which no posture is preferred. A body may lie, or stand on its hands.
 
-How the pelvis is turned in that frame is one more vector of the Gaussian, so that shoulders, spine and thighs show it
-too. The root is averaged of this and of the pelvis' own joints: by these where they are exact, by the whole body where
-they are noisy.
+The rotation of the pelvis in that frame is another vector of the Gaussian, so shoulders, spine and thighs inform it
+too. The root's rotation is a weighted average of this estimate and the estimate from the pelvis' own joints. If those
+joints are exact, they determine it; if they are noisy, the whole body does.
 
-The pelvis is a rigid part of the body that carries both hips and the lowest joint of the spine. The line to the chest,
-three times as long, is less noisy, but bends with the spine: motion files turn their pelvis by 0.9 degrees (median)
-otherwise than the rigid part, and by 3.4 otherwise than hips and chest (validation people).
+The pelvis is a rigid part that carries both hips and the lowest spine joint. The line to the chest is three times as
+long and less noisy, but bends with the spine. The pelvis of motion files differs by 0.9 degrees (median) from the rigid
+part, and by 3.4 degrees from the frame of hips and chest (validation people).
 """
 
 from __future__ import annotations
@@ -33,39 +33,39 @@ from steadypose.prior.models.weights import Arrays, load_weights
 
 DIMENSIONS, TURNS = 66, 3
 UNLIKE = 0.01
-"""Standard deviation along an axis by which any joint may differ from what training people do, metres."""
+"""Standard deviation along an axis of a joint's difference from the postures of training people, metres."""
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
-"""Bounds of a joint's standard deviation, metres; one that is not known has the largest."""
+"""Bounds of a joint's standard deviation, metres; an unknown joint has the upper bound."""
 
 LENGTH_SIGMA = 0.01
-"""Standard deviation of a person's bone lengths, assumed, metres."""
+"""Assumed standard deviation of a person's bone lengths, metres."""
 _ROUNDS = 2
 
 LEAST_SIGMA = math.radians(0.5)
-"""Least standard deviation of a root about an axis, whatever the sensor, radians."""
+"""Least standard deviation of the root's rotation about an axis, for any sensor, radians."""
 
 WITHIN = np.radians((1.5, 4.0, 5.0))
-"""Standard deviations about the pelvis' axes of its turn from what a known body's posture shows, radians."""
+"""Standard deviations about the pelvis' axes of its rotation, given exact joints of the rest of the body, radians."""
 
 DEPENDENT = 1.7
-"""Factor on the covariance of the average of the two estimates, which share most of their noise (validation people)."""
+"""Factor on the covariance of the averaged root, because the two estimates share most noise (validation people)."""
 
 _CORNERS = (*HIPS, *SHOULDERS)
 _REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
 
 _CARRIED = (*HIPS, J["spine1"])
 _LEAST = 1e-6
-"""Moment added to those of a body whose bones may have no length, square metres."""
+"""Moment added to a body's moments, so that bones without length cause no division by zero, m²."""
 
 
 class Expected(NamedTuple):
-    """Of B bodies.
+    """Expected joints of B bodies.
 
     Attributes:
         positions: (B, 22, 3) metres.
         root: (B, 3, 3) orientations of the pelvis.
-        root_covariance: (B, 3, 3) rad² about the pelvis' axes, as far as the noise of joints causes it.
+        root_covariance: (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise.
     """
 
     positions: Floats
@@ -85,12 +85,17 @@ class LivePosture:
 
     @classmethod
     def load(cls, weights: str) -> LivePosture:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         return cls(load_weights(weights, "posture")[0])
 
     def __call__(self, positions: Floats, sigma: Floats, offsets: Floats) -> Expected:
-        """What to expect of joints (B, 22, 3) metres, each with an error of ``sigma`` (B, 22) metres along an axis, of
-        people with bones ``offsets`` (B, 22, 3)."""
+        """Estimate joints from noisy ones.
+
+        Args:
+            positions: (B, 22, 3) metres, observed joints.
+            sigma: (B, 22) metres, their standard deviations along an axis.
+            offsets: (B, 22, 3) metres, the people's bones.
+        """
         frame, middle, size = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1), body_size(offsets)
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
@@ -106,11 +111,11 @@ class LivePosture:
 
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
-    """(B, 3, 3) orientations of the root: the posture's and that of the pelvis' own joints, by their covariances.
+    """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances.
 
     Args:
-        expected: of these bodies.
-        positions: (B, 22, 3) metres, as observed.
+        expected: the posture's estimate of these bodies.
+        positions: (B, 22, 3) metres, observed joints.
         sigma: (B, 22) metres, their standard deviations along an axis.
         offsets: (B, 22, 3) metres, the bones.
     """
@@ -125,17 +130,17 @@ def _rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
 
 
 class RootCovariance:
-    """The covariance of a root's orientation, of joints and deviations as published: no message has to carry it.
+    """Computes the covariance of a root's orientation from published joints and deviations; messages do not carry it.
 
     Args:
-        weights: the posture's weight set, or a path to a ``.safetensors`` file.
+        weights: weight set of the posture, or a path to a ``.safetensors`` file.
     """
 
     def __init__(self, weights: str = "default") -> None:
         self._posture = LivePosture.load(weights)
 
     def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
-        """(B, 3, 3) rad², of rotations about the axes of the positions.
+        """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame.
 
         Args:
             positions: (B, 22, 3) metres.
@@ -152,10 +157,10 @@ class RootCovariance:
 
 @njit(cache=True)
 def _condition(covariance, noise, off, left):
-    """A Gaussian of ``covariance`` (66, 66) about 0, given ``off`` (B, 66), observed with variances ``noise`` (B, 66).
+    """Condition a zero-mean Gaussian of ``covariance`` (66, 66) on observations ``off`` (B, 66) of variance ``noise``.
 
-    Observation by observation, as their errors are independent. Writes the expectation to ``off``, and the covariance
-    to ``left`` (B, 66, 66).
+    Observations are processed one by one, because their errors are independent. The expectation is written to ``off``,
+    the covariance to ``left`` (B, 66, 66).
     """
     column, expected = np.empty(DIMENSIONS), np.empty(DIMENSIONS)
     for b in range(len(off)):
@@ -177,17 +182,18 @@ def _condition(covariance, noise, off, left):
 
 
 def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:
-    """Joints given the lengths of bones, by an extended Kalman filter's update, iterated (Bell and Cathey 1993).
+    """Condition joints on bone lengths by an iterated extended Kalman filter update (Bell and Cathey 1993).
 
-    A length says nothing across its bone, but a joint's error across one bone lies along another.
+    A length gives no information across its bone, but a joint's error across one bone lies along another.
 
     Args:
         mean: (B, 22, 3) metres.
         covariance: (B, 66, 66) m².
-        lengths: (B, 21) metres, of each joint's bone but the root's, known to `LENGTH_SIGMA`.
+        lengths: (B, 21) metres, length of each joint's bone without the root, with the standard deviation
+            `LENGTH_SIGMA`.
 
     Returns:
-        Mean and covariance, given these.
+        Mean and covariance given the lengths.
     """
     given, left = mean.copy(), covariance.copy()
     _on_bones(mean, covariance, lengths, given, left)
@@ -196,10 +202,11 @@ def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats,
 
 @njit(cache=True)
 def _on_bones(prior, covariance, lengths, mean, left):
-    """As `on_bones`; ``mean`` and ``left`` come as ``prior`` and ``covariance``, and leave as results.
+    """Compute `on_bones`. ``mean`` and ``left`` start as ``prior`` and ``covariance`` and are overwritten by the
+    results.
 
-    With the Cholesky factor L of the innovations' covariance, `across` and `off` are kept as L^-1 of themselves: their
-    product is then the gain times the innovation, and the square of `across` what lengths take off the covariance.
+    With the Cholesky factor L of the innovations' covariance, `across` and `off` are multiplied by L^-1. Their product
+    is then the gain times the innovation, and the square of `across` is the reduction of the covariance by the lengths.
     """
     bones = lengths.shape[1]
     slope, off, across = np.empty((bones, 3)), np.empty(bones), np.empty((bones, DIMENSIONS))
@@ -255,7 +262,7 @@ def _on_bones(prior, covariance, lengths, mean, left):
 
 
 def trunk_frame(positions: Floats) -> Floats:
-    """Axes forward, left, up as columns (B, 3, 3), of hips and shoulders of joints (B, 22, 3)."""
+    """Return the axes forward, left, up as columns (B, 3, 3), from hips and shoulders of joints (B, 22, 3)."""
     frame = np.empty((len(positions), 3, 3))
     _trunk_frame(np.ascontiguousarray(positions), frame)
     return frame
@@ -289,12 +296,12 @@ def _to_unit(vector):
 
 
 def body_size(offsets: Floats) -> Floats:
-    """(B,) the sum of bones (B, 22, 3), relative to the rest skeleton's."""
+    """(B,) total length of bones (B, 22, 3), relative to the rest skeleton's."""
     return np.linalg.norm(offsets, axis=-1).sum(axis=-1) / _REST_SIZE
 
 
 def rigid_pelvis(positions: Floats, offsets: Floats) -> Floats:
-    """(B, 3, 3) the rotation of the pelvis' bones (B, 22, 3) that lies nearest to its joints (B, 22, 3) (Kabsch)."""
+    """(B, 3, 3) least squares rotation from the pelvis' bones (B, 22, 3) to its joints (B, 22, 3) (Kabsch)."""
     seen = positions[:, list(_CARRIED)] - positions[:, :1]
     u, _, vt = np.linalg.svd(seen.swapaxes(-1, -2) @ offsets[:, list(_CARRIED)])
     u[..., -1] *= np.linalg.det(u @ vt)[:, None]
@@ -302,9 +309,10 @@ def rigid_pelvis(positions: Floats, offsets: Floats) -> Floats:
 
 
 def rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
-    """(B, 3, 3) rad², in the pelvis' own axes, of `rigid_pelvis` of joints with deviations ``sigma`` (B, 22) metres.
+    """(B, 3, 3) rad², covariance of `rigid_pelvis` in the pelvis' own axes, for joint deviations ``sigma`` (B, 22)
+    metres.
 
-    To first order the rotation vector is M^-1 sum(b x e), of bones b and errors e, where M = sum(|b|² I - b b^T).
+    To first order, the rotation vector is M^-1 sum(b x e) for bones b and errors e, with M = sum(|b|² I - b b^T).
     """
     moved, moments = np.empty((2, len(offsets), 3, 3))
     _moments(sigma, offsets, moved, moments)
@@ -314,8 +322,8 @@ def rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
 
 @njit(cache=True)
 def _moments(sigma, offsets, moved, moments):
-    """Write the sums over bones b of |b|² I - b b^T, by the errors of joints and as they are."""
-    whole = np.empty(3)  # the pelvis' own error is in all bones
+    """Write the sums over bones b of |b|² I - b b^T, weighted by the joints' errors, and unweighted."""
+    whole = np.empty(3)  # the pelvis' own error affects all its bones
     for row in range(len(offsets)):
         for i in range(3):
             whole[i] = 0.0

@@ -1,4 +1,4 @@
-"""A gated recurrent unit and a linear layer (Cho et al. 2014), one frame at a time, without torch."""
+"""Live inference of a gated recurrent unit (Cho et al. 2014) and a linear layer, frame by frame, without torch."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class LiveRecurrent:
     """A trained network of torch's ``GRU`` and ``Linear``.
 
     Args:
-        weights: its state dict, the linear layer's as ``head``.
-        unit: name of the GRU in it.
+        weights: its state dict, with the linear layer as ``head``.
+        unit: name of the GRU in the state dict.
 
     Attributes:
-        hidden: numbers that it remembers of a body; zeros before the first frame.
+        hidden: size of a body's hidden state, which is zero before the first frame.
     """
 
     def __init__(self, weights: Arrays, unit: str) -> None:
@@ -28,7 +28,7 @@ class LiveRecurrent:
         self.hidden = weights["head.weight"].shape[1]
 
     def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> tuple[Floats32, Floats32]:
-        """The head's outputs (B, O) for one frame's features (B, F), and the state (B, `hidden`) after that frame."""
+        """Return the head's outputs (B, O) for one frame's features (B, F), and the next hidden state (B, `hidden`)."""
         reset_in, update_in, new_in = np.split(dense(features, *self._input), 3, axis=-1)
         reset_kept, update_kept, new_kept = np.split(dense(state, *self._kept), 3, axis=-1)
         new = np.tanh(new_in + sigmoid(reset_in + reset_kept) * new_kept)

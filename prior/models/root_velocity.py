@@ -1,7 +1,7 @@
-"""Root velocity of a body, read from its own motion (HM-VAE, section 3.3), as the live node runs it, without torch.
+"""Live prediction of a body's root velocity from its own motion (HM-VAE, section 3.3), without torch.
 
-A recurrent network takes the place of the paper's convolutions over the skeleton, which saw 25 frames: it is smaller,
-takes less than half the time, and strays less on validation people, as much on test people (benchmarks/NOTEBOOK.md).
+A recurrent network replaces the paper's convolutions over the skeleton, which saw 25 frames. It is smaller and takes
+less than half the time. Its drift is smaller on validation people and equal on test people (benchmarks/NOTEBOOK.md).
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from steadypose.prior.models.weights import Arrays, load_weights
 from steadypose.prior.timing.rate import FPS
 
 FRAME_S = 1.0 / FPS
-"""Seconds between the frames that the network sees."""
+"""Time between the network's frames, seconds."""
 
 FEATURES = 22 * 6
-"""Numbers of a frame: place from the root and velocity against it, of each joint."""
+"""Number of features of a frame: each joint's position and velocity relative to the root."""
 
 FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0
-"""Metres and m/s by which places and velocities are divided, and m/s at which velocities are clipped."""
+"""Unit of positions, metres, and unit and clipping bound of velocities, m/s."""
 
 
 @dataclass(frozen=True)
 class TrajectoryConfig:
-    """The size of the network, and what validation measured of its errors.
+    """The size of the network, and its errors on validation.
 
     Attributes:
-        hidden: numbers that the network remembers of a body.
-        sigma_scale: (horizontal, vertical) by which the predicted standard deviation is too small.
-        correlation_s: (horizontal, vertical) seconds for which an error of the velocity lasts: twice the integral of
+        hidden: size of a body's hidden state.
+        sigma_scale: (horizontal, vertical) error-to-sigma ratio of the predicted velocity.
+        correlation_s: (horizontal, vertical) seconds, correlation time of the velocity's error: twice the integral of
             its normalised autocorrelation.
     """
 
@@ -46,7 +46,7 @@ class TrajectoryConfig:
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> TrajectoryConfig:
-        """From the JSON of a weights file."""
+        """Build the configuration from the JSON of a weights file."""
         pairs = {name: tuple(config[name]) for name in ("sigma_scale", "correlation_s")}
         return cls(**{**config, **pairs})
 
@@ -55,9 +55,9 @@ class NewestMotion(NamedTuple):
     """The network's output for a frame, in the frame of its input.
 
     Attributes:
-        velocity: (B, 3) m/s, of the root.
-        log_sigma: (B, 3) log of the standard deviation of that along each axis, m/s.
-        state: (B, hidden) what to remember for the next frame.
+        velocity: (B, 3) m/s, velocity of the root.
+        log_sigma: (B, 3) logarithm of the velocity's standard deviation along each axis, in m/s.
+        state: (B, hidden) hidden state for the next frame.
     """
 
     velocity: Floats32
@@ -66,13 +66,13 @@ class NewestMotion(NamedTuple):
 
 
 def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> NDArray[np.float32]:
-    """(B, `FEATURES`) of B frames, turned so that each body faces +x.
+    """Build the features (B, `FEATURES`) of B frames, turned so that each body faces +x.
 
     Args:
-        joints: (B, 22, 3) metres from the root, z up.
-        before: (B, 22, 3) the same of the frame before.
-        dt: (B,) or a number, seconds between them.
-        yaw: (B,) radians, where the body looks.
+        joints: (B, 22, 3) metres relative to the root, z up.
+        before: (B, 22, 3) metres, joints in the frame before.
+        dt: (B,) or a number, seconds between the two frames.
+        yaw: (B,) radians, heading of the body.
     """
     turn, step = yaw_matrix(yaw), np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(joints),))[:, None, None]
     velocity = np.clip((joints - before) / step @ turn, -FASTEST, FASTEST) / SPEED
@@ -94,15 +94,15 @@ class LiveRootVelocity:
 
     @classmethod
     def load(cls, weights: str) -> LiveRootVelocity:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         arrays, config = load_weights(weights, "trajectory")
         return cls(TrajectoryConfig.from_dict(config), arrays)
 
     def start(self, count: int) -> Floats32:
-        """(count, hidden) what is remembered of bodies before their first frame."""
+        """(count, hidden) hidden states of bodies before their first frame."""
         return np.zeros((count, self._net.hidden), dtype=np.float32)
 
     def __call__(self, features: NDArray[np.float32], state: Floats32) -> NewestMotion:
-        """One frame: `velocity_features` (B, `FEATURES`) and what was remembered, (B, hidden)."""
+        """Process one frame: `velocity_features` (B, `FEATURES`) and hidden states (B, hidden)."""
         outputs, state = self._net(features, state)
         return NewestMotion(outputs[:, :3], outputs[:, 3:6], state)

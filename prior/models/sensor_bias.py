@@ -1,4 +1,4 @@
-"""The network of a sensor's bias as the live node runs it, `CorrectionNet` without torch, and its features."""
+"""Live inference of the sensor bias network (`CorrectionNet`) without torch, and its features."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from steadypose.prior.models.compiled_graph import Network, Program
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 SMOOTHER_DENSITY = 1.0
-"""m²/s³, of the causal smoother before the network: its answer must not jitter with its input."""
+"""Spectral density of the acceleration noise of the causal smoother before the network, m²/s³. The smoother keeps the
+input's jitter out of the network's output."""
 
 HISTORY: tuple[int, ...] = (0, 1, 2, 4, 7, 12)
-"""Frames ago, at 30 Hz, that the network sees: nothing of the future."""
+"""Ages of the network's input frames at 30 Hz, frames; it sees no future frames."""
 
 _CORNERS = (*HIPS, *SHOULDERS)
 VECTORS = 22 * len(HISTORY) + 2
@@ -30,7 +31,7 @@ class CorrectionConfig:
 
     Attributes:
         hidden: width of its two hidden layers.
-        sensor: whose error it corrects.
+        sensor: name of the sensor that it corrects.
     """
 
     hidden: int = 256
@@ -38,13 +39,15 @@ class CorrectionConfig:
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> CorrectionConfig:
-        """From the JSON of a weights file."""
+        """Build the configuration from the JSON of a weights file."""
         return cls(**config)
 
 
 def trunk_frame(positions: Floats) -> Floats:
-    """Rotations (..., 3, 3) from the frame that hips and shoulders span (x forward, y left, z up) to that of
-    ``positions`` (..., 22, 3); NaN where one of the four is missing."""
+    """Return rotations (..., 3, 3) from the trunk's frame to that of ``positions`` (..., 22, 3).
+
+    Hips and shoulders span the trunk's frame (x forward, y left, z up). It is NaN if one of the four is missing.
+    """
     hip_l, hip_r, shoulder_l, shoulder_r = (positions[..., k, :] for k in _CORNERS)
     left = _unit(hip_l - hip_r + shoulder_l - shoulder_r)
     forward = _unit(np.cross(left, shoulder_l + shoulder_r - hip_l - hip_r))
@@ -56,16 +59,17 @@ def _unit(v: Floats) -> Floats:
 
 
 def features(history: Floats, camera: Floats) -> Floats:
-    """The network's input.
+    """Build the network's input.
 
     Args:
-        history: (H, B, 22, 3) metres, z up, smoothed causally; row k is the frame `HISTORY[k]` frames ago, NaN where
-            a joint is missing.
-        camera: (3,) metres, where the sensor stands.
+        history: (H, B, 22, 3) metres, z up, causally smoothed; row k is the frame `HISTORY[k]` frames ago, NaN where a
+            joint is missing.
+        camera: (3,) metres, position of the sensor.
 
     Returns:
-        (B, FEATURES): the joints of all rows in the newest frame's trunk frame, from the middle of its hips; which way
-        is up, which way the camera; how far it is (m), and how high the hips above it (m); which joints are seen.
+        (B, FEATURES): the joints of all rows in the newest trunk frame, relative to the midpoint of the hips; the
+        directions of up and of the camera; the distance to the camera and the height of the hips above it (m); which
+        joints are observed.
     """
     newest = history[0]
     to_trunk = trunk_frame(newest).swapaxes(-1, -2)
@@ -81,9 +85,9 @@ def features(history: Floats, camera: Floats) -> Floats:
 
 
 def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(H, B, 22, 3) of the frames `HISTORY` ago among ``frames`` (T, B, 22, 3), the newest last.
+    """(H, B, 22, 3) frames of the ages `HISTORY` among ``frames`` (T, B, 22, 3), which are oldest first.
 
-    Before a body's first frame, its first frame is repeated.
+    Frames before a body's first one repeat its first.
     """
     seen = np.isfinite(frames[..., 0]).any(axis=-1)
     first = np.where(seen.any(axis=0), seen.argmax(axis=0), len(frames) - 1)
@@ -96,27 +100,27 @@ class LiveCorrection:
 
     Args:
         weights: its state dict, which is copied.
-        max_batch: frames at once.
+        max_batch: largest number of frames per call.
     """
 
     def __init__(self, weights: Arrays, max_batch: int) -> None:
         p = Program()
         self._mean, self._scale = (weights[name].astype(np.float64) for name in ("mean", "scale"))
         self._features = matrix = p.matrix(1, FEATURES)
-        for k in (0, 3, 6):  # between them, an activation and a dropout
+        for k in (0, 3, 6):  # activation and dropout lie between
             layer = part(weights, f"layers.{k}")
             matrix = p.linear(matrix, layer["weight"].T, layer["bias"], active=k > 0)
         self._answer, self._net = matrix, Network(p, max_batch)
 
     @classmethod
     def load(cls, sensor: str, max_batch: int) -> LiveCorrection:
-        """From the weights of this sensor; raises as `load_weights`."""
+        """Load the weights of this sensor; raises like `load_weights`."""
         return cls(load_weights(sensor, "correction")[0], max_batch)
 
     def __call__(self, features: Floats) -> Floats:
-        """(B, 22, 3) metres in the trunk's frame, what must be added to each joint, from `features` (B, FEATURES).
+        """Return the correction to add to each joint, (B, 22, 3) metres in the trunk's frame, from `features`.
 
-        NaN features are missing joints: they read as the training mean.
+        NaN features (missing joints) are replaced by the training mean.
         """
         rows = slice(0, len(features))
         self._net.matrix(self._features, rows)[:, 0] = np.nan_to_num((features - self._mean) / self._scale)

@@ -1,4 +1,4 @@
-"""Weights that ship: safetensors with the configuration inside, read as arrays."""
+"""Reads the bundled weights: safetensors with the configuration inside, as arrays."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from safetensors import SafetensorError, safe_open
 from steadypose import PACKAGE
 
 Arrays: TypeAlias = Mapping[str, NDArray[np.float32]]
-"""A network's weights by name, as its state dict has them: ``blocks.0.first.weight``."""
+"""A network's weights by their names in its state dict, such as ``blocks.0.first.weight``."""
 
 WEIGHTS = PACKAGE / "prior" / "weights"
-"""Folder of the weights: ``MODEL-SET.safetensors``, each with ``MODEL-SET.md``, its card."""
+"""Folder of the weights: ``MODEL-SET.safetensors``, each with its card ``MODEL-SET.md``."""
 
 LICENCES = {
     "default": "Apache-2.0; trained only on data free for products",
     "research": "non-commercial use only: trained on CC BY-NC 4.0 data too",
 }
-"""Licence of each weight set, as on its cards."""
+"""Licence of each weight set, as stated on its cards."""
 
 _PARTS = {
     "body_modes": "covariance",
@@ -39,30 +39,30 @@ _PARTS = {
     "posture": "factor mean",
     "trajectory": "head motion",
 }
-"""Top-level names of each model's state dict, by which a file of another model is recognised."""
+"""Top-level names of each model's state dict, used to detect a file of another model."""
 
 _OPTIONAL_PARTS = {"hgvae": {"completion"}, "humor": {"prior"}}
 _OTHER_SIZES = {"hmvae64": "hmvae", "hgvae-wide": "hgvae"}
 
 
 class WeightsError(ValueError):
-    """A file of weights that cannot be used. The text says what was expected."""
+    """A weights file cannot be used; the message says what was expected."""
 
 
 def weights_path(name: str, model: str) -> Path:
-    """Where ``model``'s weights lie, by the name of the weight set or as a path."""
+    """Return the path of a model's weights, given a weight set's name or a path."""
     return Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
 
 
 def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
-    """The weights and the configuration of ``model``.
+    """Load the weights and the configuration of a model.
 
     Args:
         name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
         model: the model's name, such as ``hmvae``.
 
     Raises:
-        FileNotFoundError: no such weights; says which there are.
+        FileNotFoundError: there are no such weights; the message lists those that exist.
         WeightsError: the file is damaged, was not written by `steadypose train`, or holds another model.
     """
     path = weights_path(name, model)

@@ -1,4 +1,4 @@
-"""A Kalman filter of joints, frame by frame, by the real time between frames."""
+"""A Kalman filter of joints, frame by frame, with the actual time between frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Smoothed(NamedTuple):
 
     Attributes:
         stamp_s: seconds.
-        positions: (..., 3) metres; NaN for a joint that had not been observed by then.
+        positions: (..., 3) metres; NaN for a joint that has not been observed yet.
         sigma: (...) metres, standard deviation along an axis; inf where positions are NaN.
     """
 
@@ -27,16 +27,17 @@ class Smoothed(NamedTuple):
 
 
 class ConstantVelocityFilter:
-    """Kalman filter of any number of joints at constant velocity.
+    """Constant-velocity Kalman filter of any number of joints.
 
-    Process: white-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, equation 6.2.2-12); measurement: position
-    with an isotropic error. The three coordinates of a joint then share one 2x2 covariance. A joint starts at its first
-    measurement, with a velocity of 0 +- ``initial_speed``. A missing joint coasts, and its standard deviation grows.
+    The process is white-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, equation 6.2.2-12). The measurement is
+    a position with an isotropic error. The three coordinates of a joint therefore share one 2x2 covariance. A joint
+    starts at its first measurement, with a velocity of 0 +- ``initial_speed``. A missing joint coasts, and its standard
+    deviation grows.
 
     Args:
         acceleration_density: m²/s³, power spectral density of the acceleration.
-        measurement_sigma: metres along an axis.
-        initial_speed: m/s along an axis.
+        measurement_sigma: metres along an axis, standard deviation of a measurement.
+        initial_speed: m/s along an axis, standard deviation of a joint's first velocity.
     """
 
     def __init__(
@@ -51,22 +52,22 @@ class ConstantVelocityFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew at the next frame, whatever its stamp."""
+        """Start anew at the next frame, with any stamp."""
         self._stamp_s: float | None = None
 
     def update(self, positions: ArrayLike, stamp_s: float) -> Smoothed:
-        """Take in a frame and give its estimate.
+        """Process a frame and return its estimate.
 
         Args:
             positions: (..., 3) metres, non-finite where missing.
-            stamp_s: seconds of capture, increasing.
+            stamp_s: time of capture, seconds, increasing.
         """
         measured = np.array(positions, dtype=np.float64)
         if self._stamp_s is None:
             self._joints = measured.shape[:-1]
             count = math.prod(self._joints)
             self._position, self._velocity = np.full((count, 3), np.nan), np.zeros((count, 3))
-            self._covariance = np.zeros((3, count))  # of position, of position and velocity, of velocity
+            self._covariance = np.zeros((3, count))  # variance of position, covariance of both, variance of velocity
             self._known = np.zeros(count, dtype=bool)
         else:
             if measured.shape != (*self._joints, 3):
@@ -83,11 +84,11 @@ class ConstantVelocityFilter:
 
     @property
     def velocity(self) -> Floats:
-        """(..., 3) m/s at the newest frame; 0 for a joint not observed so far."""
+        """(..., 3) m/s at the newest frame; 0 for a joint that has not been observed yet."""
         return self._velocity.reshape(*self._joints, 3)
 
     def predict(self, stamp_s: float) -> Smoothed | None:
-        """Where the joints are expected at ``stamp_s``, before they are observed; None before the first frame."""
+        """Predict the joints at ``stamp_s``, before they are observed; None before the first frame."""
         if self._stamp_s is None:
             return None
         step = stamp_s - self._stamp_s
@@ -103,7 +104,7 @@ class ConstantVelocityFilter:
             self._velocity[flat] = 0.0
 
     def _estimate(self, stamp_s: float, positions: Floats, variance: Floats) -> Smoothed:
-        # rounding may leave the variance of a long-settled joint a hair under zero
+        # rounding can make the variance of a settled joint slightly negative
         sigma = np.where(self._known, np.sqrt(np.maximum(variance, 0.0)), np.inf)
         return Smoothed(stamp_s, positions.reshape(*self._joints, 3), sigma.reshape(self._joints))
 
@@ -129,7 +130,7 @@ def _predict(step, density, position, velocity, covariance):
 
 @njit(cache=True)
 def _correct(measured, sigma, initial_speed, position, velocity, covariance, known):
-    """Take in the measurement (N, 3) of the newest frame."""
+    """Update with the measurement (N, 3) of the newest frame."""
     noise = sigma**2
     for joint in range(len(measured)):
         if not math.isfinite(measured[joint, 0] + measured[joint, 1] + measured[joint, 2]):

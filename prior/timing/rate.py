@@ -1,4 +1,4 @@
-"""The one rate of frames."""
+"""The frame rate."""
 
 FPS = 30.0
-"""Frames a second of the prior's grid, of prepared motion and of every model."""
+"""Rate of the prior's grid, of prepared motion and of every model, frames per second."""

@@ -1,7 +1,8 @@
-"""From a camera's irregular stamps to the prior's 30 Hz grid, by capture time.
+"""Resamples a camera's frames with irregular stamps to the prior's 30 Hz grid, by capture time.
 
-Frames that a tracker at 15 Hz gives twice, because its camera has 30, are dropped (`Republished`). Of cameras faster
-than the grid, frames between grid times are not thrown away: they take noise off the others (`DecimationFilter`).
+A tracker at 15 Hz may publish each result twice, because its camera runs at 30 Hz; repetitions are dropped
+(`Republished`). If a camera is faster than the grid, frames between grid times reduce the noise of the others
+(`DecimationFilter`).
 """
 
 from __future__ import annotations
@@ -18,39 +19,40 @@ from steadypose.prior.timing.rate import FPS
 
 PERIOD_NS = round(1e9 / FPS)
 MAX_GAP_NS = 150_000_000
-"""A joint not seen for longer than this is missing in between, not interpolated."""
+"""Longest gap of a joint that is interpolated, nanoseconds."""
 LOOK_AHEAD_NS = 10_000_000
-"""A frame this much older than its grid time is carried forward to it, rather than waiting for the next frame."""
+"""Largest age of a frame at which it is extrapolated to the grid time without waiting for the next one, nanoseconds."""
 LOOK_AHEAD_PERIODS = 0.35
-"""The same in periods of the stream, for fast ones: extrapolated by a whole period, noise has 5 times its variance."""
+"""The same limit for fast streams, periods of the stream. Extrapolating a whole period multiplies noise variance by
+5."""
 PERIOD_GAIN = 0.1
-"""Weight of the newest in the running mean of a stream's periods."""
+"""Weight of the newest period in the running mean of a stream's periods."""
 
 RUNS = 9
-"""New frames over which repetitions are counted."""
+"""Number of new frames over which repetitions are counted."""
 RARE = 2
-"""So many of the longest counts are left out: somebody simulated, who moves without noise, may stand still."""
+"""Number of the longest counts that are ignored, because a simulated person without noise may stand still."""
 
 PERIODS = 7
-"""Periods of which the median is a stream's."""
+"""Number of frame intervals whose median is a stream's period."""
 REGULAR = (0.5, 1.5)
-"""Periods of the frames that are used, as multiples of the median."""
+"""Range of the intervals between the frames used, as multiples of the median."""
 ROUNDED, KEPT = 0.1, 0.55
-"""``m`` is the quotient of the rates, less the first, rounded; it is kept as long as it is off by less than the
-second."""
+"""Constants of the factor ``m``: it is the ratio of the rates minus the first, rounded, and is kept while it is off by
+less than the second."""
 MAX_FACTOR = 8
-"""Of still faster streams the nearest frames are used alone."""
+"""Largest factor ``m``; in faster streams, only the nearest frames are used."""
 MEMORY_S = 0.5
-"""Of the running means of squared residuals."""
+"""Time constant of the running means of squared residuals, seconds."""
 MIN_FRAMES = 6
-"""Frames of a joint before its noise is known."""
+"""Number of frames of a joint before its noise is known."""
 OUTLIER = 3.0
-"""Standard deviations: a residual above this leaves the joint as it came, so that an outlier is not spread over its
-neighbours; a square enters the mean at most `OUTLIER` squared times as large as the mean."""
+"""Largest residual at which a joint is filtered, standard deviations. Beyond it, the joint does not change, so that an
+outlier does not affect its neighbours. Squares are clipped in the mean at `OUTLIER` squared times the mean."""
 
 
 NONE = 1e-14
-"""Square metres: a smaller residual is rounding; such joints stay as they came to the last bit, as frozen ones must."""
+"""Largest squared residual that is rounding, m². Such joints stay bit for bit, as frozen joints must."""
 
 
 class Frame(NamedTuple):
@@ -62,16 +64,16 @@ class Frame(NamedTuple):
 
 
 class Resampler:
-    """Interpolates every slot's joints to grid times ``anchor + n / 30 s``, as frames come in.
+    """Interpolates every slot's joints to grid times ``anchor + n / 30 s``, as frames arrive.
 
-    Between two observations of a joint its position is interpolated linearly, with the lesser confidence. A grid
-    frame is returned as soon as a frame is no more than 10 ms older: a stream of 30 Hz whose stamps jitter by a
-    few milliseconds then costs no extra frame of delay.
+    Between two observations, a joint's position is interpolated linearly, with the lesser confidence. A grid frame is
+    returned as soon as a frame at most 10 ms older has arrived. A stream of 30 Hz whose stamps jitter by a few
+    milliseconds then has no extra frame of delay.
 
     Args:
-        slots: bodies at most.
-        aligned: whether the grid lies at whole multiples of its period, rather than at the first frame.
-        delayed: whether answers are delayed anyway; see `DecimationFilter`.
+        slots: largest number of bodies.
+        aligned: whether grid times are whole multiples of the period; otherwise, the grid starts at the first frame.
+        delayed: whether the output is delayed anyway; see `DecimationFilter`.
     """
 
     def __init__(self, slots: int, *, aligned: bool = False, delayed: bool = True) -> None:
@@ -95,7 +97,7 @@ class Resampler:
         self._decimation.clear(slot)
 
     def update(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
-        """Take a frame and give the grid frames that it completes; one that is republished counts as none.
+        """Process a frame and return the grid frames that it completes. A republished frame is ignored.
 
         Args:
             stamp_ns: capture time, later than the last.
@@ -103,7 +105,7 @@ class Resampler:
             confidence: (S, 22).
 
         Returns:
-            Frames of the grid times reached, oldest first.
+            Frames at the grid times reached, oldest first.
         """
         if self._tick_ns is None:
             first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
@@ -113,7 +115,7 @@ class Resampler:
         return self._gridded(self._decimation.update(Frame(stamp_ns, positions, confidence)))
 
     def drain(self) -> list[Frame]:
-        """The grid frames that the decimation filter still holds, at the end of a stream."""
+        """Return the grid frames that the decimation filter still holds at the end of a stream."""
         return self._gridded(self._decimation.drain())
 
     def _gridded(self, frames: list[Frame]) -> list[Frame]:
@@ -125,7 +127,7 @@ class Resampler:
         self._newest_ns = stamp_ns
         look_ahead_ns = min(LOOK_AHEAD_NS, round(LOOK_AHEAD_PERIODS * self._period_ns))
         seen = np.isfinite(positions[..., 0])
-        # Row 1 is each joint's last observation, row 0 the one before.
+        # row 1 is each joint's last observation, row 0 the one before
         for store, value in (
             (self._seen_ns, np.full(seen.shape, stamp_ns)),
             (self._positions, positions),
@@ -153,7 +155,7 @@ class Resampler:
 
 
 class Republished:
-    """Tells repetitions that a stream makes regularly, which bring nothing new, from a body at rest without noise."""
+    """Distinguishes frames that a stream repeats regularly from a body at rest without noise."""
 
     def __init__(self) -> None:
         self._newest: NDArray[np.float64] | None = None
@@ -161,7 +163,7 @@ class Republished:
         self._runs: deque[int] = deque([0] * RUNS, maxlen=RUNS)
 
     def update(self, positions: NDArray[np.float64]) -> bool:
-        """Whether a frame, of joints (S, 22, 3) with NaN where unobserved, is the one before, republished."""
+        """Whether a frame repeats the last one. ``positions`` are (S, 22, 3), NaN where unobserved."""
         if self._newest is not None and np.array_equal(positions, self._newest, equal_nan=True):
             self._run += 1
             return self._run <= sorted(self._runs)[-RARE - 1]
@@ -171,18 +173,18 @@ class Republished:
 
 
 class DecimationFilter:
-    """Local quadratic regression (Savitzky and Golay 1964, with the frames' own stamps) of each joint, before a stream
-    of ``m`` times the grid's rate is decimated.
+    """Anti-aliasing filter of each joint, for a stream of ``m`` times the grid's rate.
 
-    A frame is fitted with the frames of two periods of the grid before it, and of half a period after it, for which it
-    waits. Noise that differs from frame to frame leaves the same residuals in every ``m``-th frame as in all; what
-    motion leaves grows with the third power of their distance. The ratio of the two says how much of a residual is
-    noise, and so much of it is taken away: motion without noise stays as it came.
+    It is a local quadratic regression (Savitzky and Golay 1964, with the frames' own stamps). A frame is fitted
+    together with the frames of two grid periods before it and of half a period after it, for which it waits.
+    Independent noise leaves the same residuals in every ``m``-th frame as in all frames. Residuals of motion grow with
+    the third power of the frames' distance. The ratio of the two gives the share of noise in a residual, and that share
+    is removed. Motion without noise does not change.
 
     Args:
-        slots: bodies at most.
-        delayed: whether answers are delayed anyway; if not, a frame waits for its successor alone, and only if that is
-            sooner than half a period.
+        slots: largest number of bodies.
+        delayed: whether the output is delayed anyway. If not, a frame waits only for its successor, and only if that
+            arrives within half a period.
     """
 
     def __init__(self, slots: int, *, delayed: bool) -> None:
@@ -191,7 +193,7 @@ class DecimationFilter:
         self._factor, self._successors = 1, 0
         self._frames: deque[Frame] = deque(maxlen=1)
         self._waiting = 0
-        self._motion = 1.0  # squared residuals of motion in all frames, by those in every m-th
+        self._motion = 1.0  # ratio of motion's squared residuals in all frames to those in every m-th
         self._squares = np.zeros((2, slots, 22))
         self._counted = np.zeros((slots, 22))
 
@@ -202,7 +204,7 @@ class DecimationFilter:
         self._counted[slot] = 0
 
     def update(self, frame: Frame) -> list[Frame]:
-        """Take a frame, and give those that need not wait, oldest first."""
+        """Process a frame and return the frames that need not wait, oldest first."""
         if self._frames:
             self._periods.append(frame.stamp_ns - self._frames[-1].stamp_ns)
         passed = self.drain() if self._adapt_factor() else []
@@ -214,12 +216,12 @@ class DecimationFilter:
         return passed
 
     def drain(self) -> list[Frame]:
-        """The frames that wait for successors, as they came."""
+        """Return the frames that wait for successors, unfiltered."""
         waiting, self._waiting = self._waiting, 0
         return list(self._frames)[len(self._frames) - waiting :]
 
     def _adapt_factor(self) -> bool:
-        """Follow the stream's rate; whether the factor has changed."""
+        """Adapt the factor to the stream's rate; returns whether it has changed."""
         if len(self._periods) < PERIODS:
             return False
         ratio = min(1e9 / FPS / statistics.median(self._periods) - ROUNDED, MAX_FACTOR)
@@ -241,11 +243,11 @@ class DecimationFilter:
         return True
 
     def _windows(self, values: Floats) -> tuple[Floats, Floats]:
-        """Of ``3 m + 1`` values, those that a frame is fitted to, and every ``m``-th."""
+        """Select from ``3 m + 1`` values those that a frame is fitted to, and every ``m``-th value."""
         return values[-1 - self._successors - 2 * self._factor :], values[:: self._factor]
 
     def _filtered(self) -> Frame:
-        """The frame that has its successors."""
+        """Return the frame that now has its successors, filtered."""
         frame = self._frames[-1 - self._successors]
         if self._factor == 1 or len(self._frames) <= 3 * self._factor or not self._is_regular():
             return frame
@@ -271,15 +273,15 @@ class DecimationFilter:
 
 
 class _Fit(NamedTuple):
-    """Quadratics through positions."""
+    """Quadratics fitted to positions."""
 
-    value: Floats  # (..., 3) at time 0
-    square: Floats  # (...) mean squared residual, a vector's, by degrees of freedom
-    largest: Floats  # (...) length of the largest residual
+    value: Floats  # (..., 3) value at time 0
+    square: Floats  # (...) squared residual vectors, summed and divided by the degrees of freedom
+    largest: Floats  # (...) length of the largest residual vector
 
 
 def _fit(time: Floats, positions: Floats) -> _Fit:
-    """Fit positions (T, ..., 3) at ``time`` (T,)."""
+    """Fit quadratics to positions (T, ..., 3) at times (T,)."""
     basis = np.vander(time, 3, increasing=True)
     solved = np.linalg.pinv(basis)
     residuals = positions - np.einsum("st,t...->s...", basis @ solved, positions)

@@ -1,4 +1,4 @@
-"""Sizes of HG-VAE and of the networks beside it, as stored with their weights; its nodes and their unit."""
+"""Sizes of HG-VAE and of its companion networks, as stored with their weights; its nodes and their unit."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 JOINT_NODES = 66
-"""22 joints, 3 coordinates: node ``3 * joint + axis``."""
+"""Number of nodes: 22 joints with 3 coordinates each, node ``3 * joint + axis``."""
 
 SCALE = 0.2
-"""Metres, the unit of the networks' inputs and outputs."""
+"""Unit of the networks' inputs and outputs, metres."""
 
 TRACK_LOG_VAR = -4.0
-"""Log-variance of tracks for which an output of 0 stands: a deviation of 2.7 cm"""
+"""Log-variance of tracks at an output of 0, in units of `SCALE`: a standard deviation of 2.7 cm."""
 
 
 class Level(NamedTuple):
-    """One stochastic level: how many nodes, and how many latent features each has."""
+    """One stochastic level: number of nodes, and number of latent features of each."""
 
     nodes: int
     latent: int
@@ -27,9 +27,9 @@ class CompletionConfig:
     """Sizes of the completion network.
 
     Attributes:
-        patch: frames in a node; a window has whole patches.
-        features: of each node.
-        blocks: graph convolutional blocks between reading and writing.
+        patch: frames in a node; a window consists of whole patches.
+        features: number of features of each node.
+        blocks: number of graph convolutional blocks between the input and the output layer.
     """
 
     patch: int = 5
@@ -42,14 +42,14 @@ class HGVAEConfig:
     """The sizes of an HG-VAE.
 
     Attributes:
-        frames: T, frames of a window at 30 Hz (the paper has 50).
-        coefficients: of the cosine transform that are kept, lowest first (the paper keeps all T).
-        features: F, of every node in the deterministic streams (the paper has 256).
-        levels: stochastic levels, the top one first (the paper: 1, 8, 24 and 54 nodes).
-        stochastic: how many of the levels, counted from the bottom, are random; those above stay at their prior's
-            mean and carry nothing (table 1: depth at equal capacity). None: all.
-        actions: action classes, given one-hot beside the top latent; 0 for a model without.
-        completion: sizes of the completion network; None for a model without.
+        frames: T, frames of a window at 30 Hz (paper: 50).
+        coefficients: number of coefficients of the cosine transform that are kept, lowest first (paper: all T).
+        features: F, features of every node in the deterministic streams (paper: 256).
+        levels: stochastic levels, top level first (paper: 1, 8, 24 and 54 nodes).
+        stochastic: number of random levels, counted from the bottom. Levels above stay at their prior's mean and carry
+            no information (table 1: depth at equal capacity). None means all levels.
+        actions: number of action classes, given one-hot beside the top latent; 0 for a model without actions.
+        completion: sizes of the completion network; None for a model without one.
     """
 
     frames: int = 50
@@ -76,8 +76,8 @@ class FaultNetConfig:
     """Sizes of the fault network.
 
     Attributes:
-        frames: T, of HG-VAE's window.
-        features: of each of its 66 nodes.
+        frames: T, frames of HG-VAE's window.
+        features: number of features of each of its 66 nodes.
     """
 
     frames: int = 50

@@ -1,8 +1,8 @@
-"""The fault network as the live node runs it, `FaultNet` without torch; its features; and the scale of its scores.
+"""Live inference of the fault network (`FaultNet`) without torch, its features, and the calibration of its scores.
 
-The fault network gives each joint's log odds of being at fault; a window's score is the highest of its joints'. Both
-are expressed as an anomaly: -log10 of the rate at which clean windows of people unseen in training, of the same pace,
-score at least as high. An anomaly of 2 occurs in one of a hundred clean windows.
+The fault network gives each joint's log odds of being faulty. A window's score is the highest score of its joints. Both
+are converted to an anomaly: -log10 of the rate at which clean windows of the same pace, of people unseen in training,
+score at least as high. One clean window in a hundred has an anomaly of 2 or more.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from steadypose.prior.models.weights import Arrays, load_weights, part, weights_
 from steadypose.prior.timing.rate import FPS
 
 RECENT = 15
-"""Newest frames of a window that are scored: a fault that has just begun must not be averaged with sound frames."""
+"""Number of the newest frames of a window that are scored, so that clean frames do not hide a fault that just began."""
 
 OFF_SCALE = 0.02
-"""Metres, unit of the residuals against HG-VAE, which enter by asinh: linear when small, logarithmic when large."""
+"""Unit of the residuals against HG-VAE, metres. They enter by asinh: linear if small, logarithmic if large."""
 
 ROUGH_SCALE = 0.003
-"""Metres, unit of the RMS second difference of a track, which enters by its logarithm."""
+"""Unit of the RMS second difference of a track, which enters by its logarithm, metres."""
 
 SENSOR_SCALE = 0.01
-"""Metres, unit of the sensor's error, which enters by its logarithm."""
+"""Unit of the sensor's error, which enters by its logarithm, metres."""
 
 MISSING = (0, 4, 8, 14)
-"""Joints missing at which the scale was measured; between them it is interpolated."""
+"""Numbers of missing joints at which the calibration was measured; it is interpolated between them."""
 
 FROZEN_ODDS = 12.0
 """Log odds of a joint whose last position the sensor repeats while the others jitter."""
 
 SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
-"""Metres along an axis, errors of the sensor at which the scale was measured."""
+"""Sensor errors along an axis at which the calibration was measured, metres."""
 
 PACES, PACE_EDGES = (0.03, 0.5, 1.5), (0.274, 0.866)
-"""m/s, of `pace`: typical values of three classes of windows, and the edges between these. Most windows of a recording
-are of people who stand; fast motion is rare in training and would score high for that alone."""
+"""Typical values of `pace` in three classes of windows, and the edges between the classes, m/s. In most windows of a
+recording people stand. Fast motion is rare in training and would score high for that reason alone."""
 
 RATES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-"""Rates of clean windows that score higher than the stored quantiles."""
+"""Rates at which clean windows score higher than the stored quantiles."""
 
 
 def fault_features(
@@ -58,18 +58,18 @@ def fault_features(
     sensor_sigma: NDArray[np.floating] | float,
     mean: NDArray[np.floating],
 ) -> NDArray[np.float32]:
-    """The input of `FaultNet`.
+    """Build the input of `FaultNet`.
 
     Args:
-        x: (B, 66, T) metres of a body of standard size, tracks; not read where not observed.
+        x: (B, 66, T) metres of a body of standard size, tracks; ignored where unobserved.
         reconstructed: (B, 66, T) metres, HG-VAE's mean.
         sigma: (B, 66, T) metres, HG-VAE's standard deviation.
         observed: (B, 66, T) more than 0 where observed.
         sensor_sigma: (B,) metres along an axis, total error of the sensor.
-        mean: (66,) metres, of the network.
+        mean: (66,) metres, the network's training mean.
 
     Returns:
-        (B, 66, 4 T + 2): a track, its residual against the reconstruction, HG-VAE's deviation, and what was observed;
+        (B, 66, 4 T + 2): the track, its residual against the reconstruction, HG-VAE's deviation, and the observed mask;
         the RMS second difference of the newest frames (near 0 if a tracker repeats its output); the sensor's error.
     """
     count, tracks, frames = x.shape
@@ -93,7 +93,7 @@ class LiveFaultNet:
     Args:
         config: its sizes.
         weights: its state dict.
-        max_batch: windows at once.
+        max_batch: largest number of windows per call.
     """
 
     def __init__(self, config: FaultNetConfig, weights: Arrays, max_batch: int) -> None:
@@ -105,10 +105,10 @@ class LiveFaultNet:
 
     @classmethod
     def load(cls, weights: str, max_batch: int) -> LiveFaultNet:
-        """The one beside HG-VAE's weights of this name.
+        """Load the fault network that belongs to HG-VAE's weights of this name.
 
         Raises:
-            FileNotFoundError: there is none; says which there are.
+            FileNotFoundError: there is none; the message lists those that exist.
         """
         path = weights_path(weights, "hgvae").with_suffix(".faults.safetensors")
         arrays, config = load_weights(str(path), "hgvae")
@@ -117,7 +117,7 @@ class LiveFaultNet:
     def __call__(
         self, x: Floats, reconstructed: Floats, sigma: Floats, observed: Floats, sensor_sigma: Floats
     ) -> Floats:
-        """(B, 22) log-odds that a joint is faulty; the arguments are those of `fault_features`."""
+        """Return log odds (B, 22) that a joint is faulty; arguments as in `fault_features`."""
         rows = slice(0, len(x))
         self._net.matrix(self._features, rows)[:] = fault_features(
             x, reconstructed, sigma, observed, sensor_sigma, self._mean
@@ -131,17 +131,17 @@ class Calibration:
     """Scores of clean windows, by missing joints, sensor error and pace.
 
     Attributes:
-        quantiles: (M, S, P, R) of the window's score, at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`.
+        quantiles: (M, S, P, R) quantiles of the window's score at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`.
     """
 
     quantiles: Floats
 
     @classmethod
     def load(cls, weights: str) -> Calibration:
-        """The calibration that belongs to these weights.
+        """Load the calibration that belongs to these weights.
 
         Raises:
-            FileNotFoundError: there is none; says how to make it.
+            FileNotFoundError: there is none; the message says how to make it.
         """
         path = weights_path(weights, "hgvae").with_suffix(".anomaly.json")
         if not path.is_file():
@@ -153,10 +153,10 @@ class Calibration:
         path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
 
     def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats, paces: Floats) -> Floats:
-        """(B, R) what clean windows score at `RATES`, interpolated between what was measured.
+        """Return the scores (B, R) of clean windows at `RATES`, interpolated between the measured conditions.
 
         Args:
-            missing: (B,) joints missing.
+            missing: (B,) numbers of missing joints.
             sensor_sigma: (B,) metres along an axis, error of the sensor.
             paces: (B,) m/s, `pace`.
         """
@@ -167,24 +167,24 @@ class Calibration:
 
 
 def pace(mean: Floats) -> Floats:
-    """(B,) m/s, the upper quartile of the joints' RMS speeds in tracks (B, 66, T) as HG-VAE reconstructs them.
+    """(B,) m/s, upper quartile of the joints' RMS speeds in tracks (B, 66, T) reconstructed by HG-VAE.
 
-    Neither a single limb at fault nor the sensor's noise changes it much.
+    Neither a single faulty limb nor the sensor's noise changes it much.
     """
     steps = np.diff(mean.reshape(len(mean), -1, 3, mean.shape[-1]), axis=-1) * FPS
     speeds = np.sort(np.sqrt((steps**2).sum(axis=2).mean(axis=-1)), axis=1)
-    # as numpy.quantile, which takes a quarter of a millisecond: of 22 joints, between the 16th and the 17th
+    # equals numpy.quantile, which takes a quarter of a millisecond: for 22 joints, between the 16th and the 17th
     place, share = divmod(0.75 * (speeds.shape[1] - 1), 1.0)
     low, high = speeds[:, int(place)], speeds[:, int(place) + 1]
     return high - (high - low) * (1.0 - share)
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
-    """(B, 22) log odds of a fault network; -inf for joints not seen in the scored frames.
+    """Adjust the fault network's log odds (B, 22) for frozen joints; -inf for joints unobserved in the scored frames.
 
     Args:
-        odds: (B, 22) of `FaultNet`.
-        observed: (B, 66, T) more than 0 where seen.
+        odds: (B, 22) log odds of `FaultNet`.
+        observed: (B, 66, T) more than 0 where observed.
         frozen: (B, 22) joints whose last position the sensor repeats.
     """
     seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
@@ -192,11 +192,11 @@ def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Flo
 
 
 def decimals(score: Floats, limits: Floats) -> Floats:
-    """-log10 of the rate at which clean windows score at least so high.
+    """Return -log10 of the rate at which clean windows score at least as high.
 
     Args:
-        score: (B, K) of windows or of their joints.
-        limits: (B, R) of `Calibration.limits`.
+        score: (B, K) scores of windows or of their joints.
+        limits: (B, R) from `Calibration.limits`.
     """
     anomaly = np.empty(score.shape)
     _decimals(score, limits, -np.log10(RATES), anomaly)
@@ -204,7 +204,7 @@ def decimals(score: Floats, limits: Floats) -> Floats:
 
 
 def _interpolation_weights(value: Floats, knots: Floats) -> Floats:
-    """(B, K) weights of the two of ``knots`` on either side of each value (B,); the ends go on."""
+    """(B, K) linear interpolation weights of ``knots`` for each value (B,); values beyond the ends take the end's."""
     place = np.interp(value, knots, np.arange(len(knots)))
     return np.maximum(1 - np.abs(place[:, None] - np.arange(len(knots))), 0.0)
 
@@ -218,6 +218,6 @@ def _decimals(score, quantiles, heights, anomaly):
             for limit in range(len(limits)):
                 below += score[row, k] > limits[limit]
             low = min(max(below - 1, 0), len(limits) - 2)
-            # beyond the rarest rate measured, the tail goes on as it went between the last two
+            # beyond the lowest measured rate, extrapolate the tail from the last two
             rising = (heights[low + 1] - heights[low]) / max(limits[low + 1] - limits[low], 1e-6)
             anomaly[row, k] = max(heights[low] + rising * (score[row, k] - limits[low]), 0.0)

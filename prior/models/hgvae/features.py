@@ -1,9 +1,10 @@
-"""Windows of joints as HG-VAE reads them: tracks about a smooth path of the trunk, facing forward, of one size.
+"""HG-VAE's input: windows of joints as tracks about a smooth path of the trunk, facing forward, of standard size.
 
-The path is a low-passed mean of the visible joints of the trunk, so that it neither jitters with one noisy joint nor
-jumps when one disappears. All joints but the pelvis are relative to it; the pelvis's track is relative to the path's
-mean, and so holds the locomotion. Unobserved entries are interpolated: in a gap, a joint's offset from its parent is
-interpolated linearly; before the first and after the last observation it is held. Completion starts from this.
+The path is a low-passed mean of the observed joints of the trunk, so that it neither jitters with one noisy joint nor
+jumps when a joint disappears. All joints except the pelvis are relative to the path. The pelvis's track is relative to
+the path's mean, so it contains the locomotion. Unobserved entries are interpolated: in a gap, a joint's offset from its
+parent is interpolated linearly; before the first and after the last observation, it is held. Completion starts from
+this.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right
                                  "neck")])  # fmt: skip
 _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
 _PATH_COEFFICIENTS = 8
-"""Coefficients kept of the cosine transform of the trunk's path: a low pass at 2 Hz, in a window of 50 frames"""
+"""Number of cosine coefficients of the trunk's path that are kept: a low pass at 2 Hz for a window of 50 frames."""
 
 
 class Tracks(NamedTuple):
     """Windows, each in its body's frame.
 
     Attributes:
-        x: (..., 66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never seen.
-        observed: (..., 66, T) 1 where seen, else 0.
-        path: (..., T, 3) metres, world: the origin of all joints but the pelvis, whose origin is the path's mean.
-        yaw: (...) radians, the mean heading of the window.
+        x: (..., 66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never observed.
+        observed: (..., 66, T) 1 where observed, else 0.
+        path: (..., T, 3) metres, world, origin of all joints except the pelvis, whose origin is the path's mean.
+        yaw: (...) radians, mean heading of the window.
     """
 
     x: NDArray[np.float64]
@@ -42,16 +43,16 @@ class Tracks(NamedTuple):
 
 
 def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(...) total length of legs and spine, of bones (..., 22, 3), relative to the generic adult's."""
+    """(...) total length of legs and spine with bones (..., 22, 3), relative to the generic adult's."""
     return np.sqrt((offsets[..., _TALL, :] ** 2).sum(axis=-1)).sum(axis=-1) / _STANDARD
 
 
 def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
-    """Windows as tracks.
+    """Convert windows to tracks.
 
     Args:
         positions: (..., T, 22, 3) metres, z up; NaN where missing.
-        size: (...) of the bodies, as `body_size` gives it.
+        size: (...) sizes of the bodies (`body_size`).
     """
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
@@ -64,7 +65,7 @@ def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float
 
 
 def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> NDArray[np.float64]:
-    """(66, T) tracks of other positions (T, 22, 3), such as ground truth, in the frame of ``tracks``."""
+    """Convert other positions (T, 22, 3), such as ground truth, to tracks (66, T) in the frame of ``tracks``."""
     local = positions - tracks.path[:, None]
     local[:, 0] = positions[:, 0] - tracks.path.mean(axis=0)
     c, s = math.cos(tracks.yaw), math.sin(tracks.yaw)
@@ -73,12 +74,12 @@ def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> 
 
 
 def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floating] | float) -> NDArray[np.float64]:
-    """Joint positions (..., K, 22, 3) metres, world, of the last K frames of windows; the inverse of `to_tracks`.
+    """Convert tracks of the last K frames to joint positions (..., K, 22, 3) metres, world: the inverse of `to_tracks`.
 
     Args:
         x: (..., 66, K) tracks of those frames.
-        tracks: the windows, of T >= K frames, in whose frames ``x`` is.
-        size: (...) of the bodies, as `body_size` gives it.
+        tracks: the windows of T >= K frames that define the frames of ``x``.
+        size: (...) sizes of the bodies (`body_size`).
     """
     batch, frames = x.shape[:-2], x.shape[-1]
     sizes, world = np.empty(batch), np.empty((*batch, frames, 22, 3))
@@ -89,10 +90,10 @@ def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floatin
 
 
 def hang_unseen(deviations: NDArray[np.floating]) -> None:
-    """Fill in joints never seen, in place: each deviates from its training mean as its parent does from its own.
+    """Fill in joints that were never observed, in place: each gets its parent's deviation from the training mean.
 
     Args:
-        deviations: (..., 66, T) tracks less the mean tracks; NaN for joints never seen in the window.
+        deviations: (..., 66, T) tracks minus the mean tracks; NaN for joints never observed in the window.
     """
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
@@ -101,7 +102,7 @@ _low_passes: dict[int, NDArray[np.float64]] = {}
 
 
 def _low_pass(frames: int) -> NDArray[np.float64]:
-    """(T, T) the projection onto the lowest cosines."""
+    """(T, T) projection onto the lowest cosines."""
     if frames not in _low_passes:
         k, n = np.arange(_PATH_COEFFICIENTS)[:, None], np.arange(frames)
         basis = np.sqrt(2 / frames) * np.cos(np.pi / (2 * frames) * (2 * n + 1) * k)
@@ -111,12 +112,12 @@ def _low_pass(frames: int) -> NDArray[np.float64]:
 
 
 # ---------------------------------------------------------------------------------------------------------------
-# Compiled. No vectors in the loops over joints and frames: making them would take most of the time.
+# Compiled, without vectors in the loops over joints and frames: allocating them would take most of the time.
 
 
 @njit(cache=True)
 def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
-    """Of B windows (B, T, 22, 3): writes the four parts of `Tracks`."""
+    """Write the four parts of `Tracks` for B windows (B, T, 22, 3)."""
     frames, joints = windows.shape[1:3]
     still = np.zeros(frames)
     middle = np.empty((frames, 3))
@@ -147,13 +148,13 @@ def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
             while parent > 0 and math.isnan(x[3 * parent, 0]):
                 parent = PARENT[parent]
             for axis in range(3):
-                # relative to the nearest joint above that was ever seen, whose gaps are bridged by now
+                # relative to the nearest ancestor that was ever observed, whose gaps are already filled
                 _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
 
 
 @njit(cache=True)
 def _from_tracks(x, path, yaws, sizes, world):
-    """Of B windows: writes ``world`` (B, K, 22, 3), from tracks (B, 66, K) and paths (B, T, 3)."""
+    """Write ``world`` (B, K, 22, 3) for B windows, from tracks (B, 66, K) and paths (B, T, 3)."""
     frames = x.shape[2]
     middle = np.empty(3)
     for window in range(len(x)):
@@ -180,7 +181,7 @@ def _mean(path, axis):
 
 @njit(cache=True)
 def _hang_unseen(deviations):
-    """As `hang_unseen`, of (N, 22, 3, T)."""
+    """Compute `hang_unseen` for (N, 22, 3, T)."""
     for row in range(len(deviations)):
         window = deviations[row]
         for joint in range(len(PARENT)):
@@ -188,13 +189,13 @@ def _hang_unseen(deviations):
             if math.isnan(window[joint, 0, 0]):
                 for axis in range(3):
                     for t in range(window.shape[-1]):
-                        # the pelvis's own track is relative to another origin
+                        # the pelvis's own track has another origin
                         window[joint, axis, t] = window[parent, axis, t] if parent > 0 else 0.0
 
 
 @njit(cache=True)
 def _bridge(track, above):
-    """Fill the gaps of a track (T,) in place: its offset from ``above`` is interpolated linearly, held at the ends."""
+    """Fill the gaps of a track (T,), in place: interpolate its offset from ``above`` linearly, hold it at the ends."""
     frames = len(track)
     last = -1
     for t in range(frames + 1):
@@ -215,7 +216,7 @@ def _bridge(track, above):
 
 @njit(cache=True)
 def _heading(positions):
-    """`prior.body.kinematics.heading` of the mean of all vectors from right to left, over hips and shoulders."""
+    """Return `prior.body.kinematics.heading` of the mean vector from right to left, over hips and shoulders."""
     a = b = 0.0
     for t in range(len(positions)):
         for k in range(len(_SIDES)):
@@ -230,7 +231,7 @@ def _heading(positions):
 
 @njit(cache=True)
 def _centre(positions, yaw, size):
-    """(T, 3) pelvis position implied by the visible joints of the trunk; interpolated, or held, where none is."""
+    """(T, 3) pelvis position from the observed joints of the trunk; interpolated or held where none is observed."""
     frames = len(positions)
     c, s = math.cos(yaw), math.sin(yaw)
     centre = np.zeros((frames, 3))
@@ -245,7 +246,7 @@ def _centre(positions, yaw, size):
                 for axis in range(3):
                     seen[axis] += positions[t, j, axis] - positions[t, 0, axis]
                 count += 1
-        # how the joint lies to the pelvis: as it was seen in this window, or as in a generic body
+        # the joint's offset from the pelvis: as observed in this window, or a generic body's
         lies[0] = size * (c * REST_POSITIONS[j, 0] - s * REST_POSITIONS[j, 1])
         lies[1] = size * (s * REST_POSITIONS[j, 0] + c * REST_POSITIONS[j, 1])
         lies[2] = size * REST_POSITIONS[j, 2]

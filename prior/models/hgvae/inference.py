@@ -1,4 +1,4 @@
-"""HG-VAE as the live node runs it, without torch: `HGVAE` at the means of its latents, of the windows of all bodies."""
+"""Live inference of HG-VAE without torch: `HGVAE` at the means of its latents, for the windows of all bodies."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from steadypose.prior.models.weights import Arrays, load_weights, part
 
 
 class Reconstruction(NamedTuple):
-    """p(x | z) of windows.
+    """The distribution p(x | z) of windows.
 
     Attributes:
         mean: (..., 66, T) metres of a body of standard size, tracks.
-        sigma: (..., 66, T) metres, standard deviation.
+        sigma: (..., 66, T) metres, standard deviations.
     """
 
     mean: NDArray[np.float64]
@@ -32,10 +32,10 @@ class LiveHGVAE:
     Args:
         config: its sizes; without actions.
         weights: its state dict, which is copied.
-        max_batch: windows at once.
+        max_batch: largest number of windows per call.
 
     Attributes:
-        frames: T, of a window.
+        frames: T, frames of a window.
     """
 
     def __init__(self, config: HGVAEConfig, weights: Arrays, max_batch: int) -> None:
@@ -76,7 +76,7 @@ class LiveHGVAE:
 
     @classmethod
     def load(cls, weights: str, max_batch: int) -> LiveHGVAE:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         arrays, config = load_weights(weights, "hgvae")
         return cls(HGVAEConfig.from_dict(config), arrays, max_batch)
 
@@ -86,7 +86,7 @@ class LiveHGVAE:
         """Encode and decode windows.
 
         Args:
-            x: (B, 66, T) metres of a body of standard size, `Tracks.x`; NaN for a joint never seen.
+            x: (B, 66, T) metres of a body of standard size, `Tracks.x`; NaN for a joint never observed.
             observed: (B, 66, T) more than 0 where observed.
             bias_sigma: (B,) metres along an axis, the sensor's bias.
         """

@@ -1,8 +1,8 @@
-"""The completion network as the live node runs it, `CompletionNet` without torch, and its features.
+"""Live inference of the completion network (`CompletionNet`) without torch, and its features.
 
-A node is a patch of the window's time; its inputs are the whole body's tracks, how near each joint's observations are,
-and each joint's noise and mobility. Beside them stands the variance of the interpolation that fills the window's gaps
-(`prior.models.hgvae.features`), with which the network's output is fused.
+A node is a patch of the window in time. Its inputs are the whole body's tracks, the nearness of each joint's
+observations, and each joint's noise and mobility. The network's output is fused with the interpolation that fills the
+window's gaps (`prior.models.hgvae.features`), weighted by the interpolation's variance.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, CompletionC
 from steadypose.prior.models.weights import Arrays, part
 
 NEAR = 8.0
-"""Nearness of an observation d frames away is 1 / (1 + d / NEAR): an exponential would make an arm seen a second ago
-the same as one never seen."""
+"""Distance at which the nearness of an observation, 1 / (1 + d / NEAR), is one half, frames. An exponential would not
+distinguish an arm that was observed a second ago from one that was never observed."""
 
 LAG = 5
-"""Frames over which the mobility of a joint, relative to its parent, is measured."""
+"""Interval over which the mobility of a joint relative to its parent is measured, frames."""
 
 GROWTH = 1.5
-"""Exponent with which the interpolation's variance grows with the time from an observation: 1 is a random walk, 2
-constant velocity. Learned instead, it is dominated by the training sensors' faults, and moves arms that rest."""
+"""Exponent of the growth of the interpolation's variance with the time from an observation: 1 is a random walk, 2
+constant velocity. A learned exponent is dominated by faults of the training sensors, and moves arms that rest."""
 
 STILL = 0.004
-"""Metres along an axis in `LAG` frames: the least mobility assumed of any joint."""
+"""Least mobility of a joint along an axis in `LAG` frames, metres."""
 
 CENTIMETRE = 0.01 / SCALE
-"""In units of `SCALE`; the noise of joints enters as the logarithm of its ratio to this"""
+"""Unit of the joints' noise, which enters by its logarithm: a centimetre in units of `SCALE`."""
 
 BIAS_SCALE = 0.01
 BIAS_MIN = 0.002
-"""Metres along an axis: the bias enters as the logarithm of its ratio to the first, at least the second."""
+"""Least bias along an axis, metres."""
 
 HALF_CERTAIN_SIGMA = 0.01
-"""Metres along an axis: a completed entry of this standard deviation has a certainty of one half."""
+"""Standard deviation along an axis at which a completed entry has a certainty of one half, metres."""
 
 FIRST_LOG_VAR = -3.0
-"""Log-variance for which an output of 0 stands, in units of `SCALE`: a deviation of 4.5 cm."""
+"""Log-variance at an output of 0, in units of `SCALE`: a standard deviation of 4.5 cm."""
 
 JOINTS = JOINT_NODES // 3
 
 FRAME_INPUTS = JOINT_NODES + 2 * JOINTS
-"""Inputs a frame: tracks, and the nearness of each joint's last and next observation."""
+"""Number of inputs per frame: tracks, and the nearness of each joint's last and next observation."""
 
 WINDOW_INPUTS = 2 * JOINTS + 2
-"""Inputs a window: noise of each joint and of all, mobility of each, and the sensor's bias."""
+"""Number of inputs per window: noise of each joint and of all joints, mobility of each joint, and the sensor's bias."""
 
 _NEVER = -1.0
 
 
 class Features(NamedTuple):
-    """Windows as the network reads them; variances are along an axis, in units of `SCALE`.
+    """The network's input. Variances are along an axis, in units of `SCALE`.
 
     Attributes:
         nodes: (B, T / patch, inputs) float32.
-        mobility: (B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, less
-            what its noise explains.
+        mobility: (B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, minus
+            the part that noise explains.
         noise: (B, 22) float32, variance of an observation: jitter and bias.
-        gap: (B, 22, T) float32, frames to an observation, 1 / (1 / last + 1 / next) between two; 0 where observed, -1
-            of a joint never seen.
+        gap: (B, 22, T) float32, frames to an observation; 1 / (1 / last + 1 / next) between two; 0 where observed, -1
+            for a joint never observed.
     """
 
     nodes: NDArray[np.float32]
@@ -77,8 +77,8 @@ class Features(NamedTuple):
     def line_variance(self) -> NDArray[np.float32]:
         """(B, 22, T) variance of the interpolation of hidden joints.
 
-        It grows with the time from an observation and with the joint's mobility, and adds to its parent's. 0 where a
-        joint is observed, infinite where it never was.
+        It grows with the time from an observation and with the joint's mobility, and includes the parent's variance. It
+        is 0 where a joint is observed, and infinite if it never was.
         """
         variance = np.empty_like(self.gap)
         _line_variance(self.mobility, self.noise, self.gap, variance)
@@ -91,10 +91,10 @@ def completion_features(
     bias_sigma: NDArray[np.floating] | float,
     patch: int,
 ) -> Features:
-    """The completion network's input.
+    """Build the completion network's input.
 
     Args:
-        deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; interpolated where not observed.
+        deviations: (B, 66, T) tracks minus the training mean, in units of `SCALE`; interpolated where unobserved.
         observed: (B, 66, T) more than 0 where observed.
         bias_sigma: (B,) metres along an axis, the sensor's bias.
         patch: frames in a node.
@@ -177,7 +177,7 @@ def _total(values):
 
 @njit(cache=True)
 def _measure_mobility(deviations, seen, mobility):
-    """Mean squared displacement of each joint relative to its parent in `LAG` frames; that of all where it has none."""
+    """Mean squared displacement of each joint relative to its parent in `LAG` frames; the mean of all if unknown."""
     tracks, frames = deviations.shape
     joints = tracks // 3
     counts = np.zeros(joints)
@@ -199,7 +199,7 @@ def _measure_mobility(deviations, seen, mobility):
 
 @njit(cache=True)
 def _measure_noise(deviations, seen, nodes, noise):
-    """Noise of each joint and of all, from the second differences of their tracks; written to every node."""
+    """Noise of each joint and of all joints, from the second differences of their tracks; written to every node."""
     tracks, frames = deviations.shape
     joints = tracks // 3
     squares, counts = np.zeros(joints), np.zeros(joints)
@@ -218,7 +218,7 @@ def _measure_noise(deviations, seen, nodes, noise):
         for node in range(len(nodes)):
             nodes[node, joint] = level
         if joint < joints:
-            noise[joint] = square / 18  # a second difference has six times the variance, and this is of three axes
+            noise[joint] = square / 18  # a second difference has six times the variance, summed over three axes
 
 
 class LiveCompletion:
@@ -227,7 +227,7 @@ class LiveCompletion:
     Args:
         config: its sizes.
         weights: its state dict.
-        max_batch: windows at once.
+        max_batch: largest number of windows per call.
     """
 
     def __init__(self, config: CompletionConfig, weights: Arrays, max_batch: int) -> None:
@@ -240,15 +240,15 @@ class LiveCompletion:
     def complete(
         self, deviations: NDArray[np.floating], observed: NDArray[np.floating], bias_sigma: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """Complete the unobserved entries of windows, in place; see `CompletionNet.complete`.
+        """Complete the unobserved entries of windows, in place (see `CompletionNet.complete`).
 
         Args:
-            deviations: (B, 66, T) tracks less the training mean, in units of `SCALE`; changed.
+            deviations: (B, 66, T) tracks minus the training mean, in units of `SCALE`; changed.
             observed: (B, 66, T) more than 0 where observed.
             bias_sigma: (B,) metres along an axis, the sensor's bias.
 
         Returns:
-            (B, 66, T) certainty of each entry, see `completion.certainty_of`.
+            (B, 66, T) certainty of each entry (see `completion.certainty_of`).
         """
         certainty = (observed > 0).astype(np.float32)
         partly = np.flatnonzero((observed == 0).any(axis=(-2, -1)))
@@ -265,7 +265,7 @@ class LiveCompletion:
 
 @njit(cache=True)
 def _fuse(written, line_variance, places, observed, deviations, certainty):
-    """As `CompletionNet.fuse` and `certainty_of`: completes the windows at ``places``, and writes their certainty."""
+    """Complete the windows at ``places`` and write their certainty, like `CompletionNet.fuse` and `certainty_of`."""
     joints, frames = line_variance.shape[1:]
     patch = written.shape[2] // (4 * joints)
     half = np.float32(2 * math.log(HALF_CERTAIN_SIGMA / SCALE))

@@ -1,1 +1,1 @@
-"""A mixture of linear filters, weighed by a network that sees the whole body: what smooths joints that are seen."""
+"""A mixture of experts that smooths observed joints: linear filters, weighted by a network of the whole body."""

@@ -1,18 +1,18 @@
 """The experts of the mixture: a bank of fixed-lag smoothers.
 
-Every mode of the body's motion, and every joint that is no part of the body, is a track
-(`prior.models.mixture.tracks`), followed by constant-velocity Kalman filters that differ in the density of their
-process noise, each with the fixed-lag smoother of its last frames. One of small density averages noise away and lags
-behind fast motion; one of large density follows everything, noise included. A smoother is computed in its
-augmented-state form (Anderson and Moore 1979, section 7.3): the positions of the last frames are updated along with the
-newest one, by way of their covariance with it, which is the RTS result without a backward pass.
+Each mode of the body's motion, and each joint outside the modes, is a track (`prior.models.mixture.tracks`). Each track
+has several constant-velocity Kalman filters that differ in the density of their process noise, each with a fixed-lag
+smoother over its last frames. A filter of small density averages noise but lags behind fast motion; a filter of large
+density follows everything, including noise. The smoothers use the augmented-state form (Anderson and Moore 1979,
+section 7.3): the positions of the last frames are updated with the newest one through their covariance with it. This
+equals the RTS result without a backward pass.
 
-Their mean, weighted by each filter's likelihood, is the static multiple-model estimate (Bar-Shalom, Li and Kirubarajan
-2001, section 11.6), with exponential forgetting. The measurement noise is unknown: for each filter it is the most
-likely one given the innovations (concentrated likelihood) and, where noise is white, that of the body's other tracks
-(`SHARED`), so that only the ratio of process to measurement noise distinguishes the filters. That mean, of each track,
-is one more expert; the experts' weights are computed by `training.networks.mixture`, from
-`prior.models.mixture.features`. Training and the live node share this code.
+The smoothers' mean, weighted by the filters' likelihoods, is the static multiple-model estimate (Bar-Shalom, Li and
+Kirubarajan 2001, section 11.6), with exponential forgetting. The measurement noise is unknown. Each filter uses the
+most likely noise given its innovations (concentrated likelihood) and, where noise is white, given the noise of the
+body's other tracks (`SHARED`). Only the ratio of process to measurement noise therefore distinguishes the filters. The
+multiple-model estimate of each track is another expert. `training.networks.mixture` computes the experts' weights from
+`prior.models.mixture.features`. Training and live inference share this code.
 """
 
 from __future__ import annotations
@@ -38,64 +38,63 @@ from steadypose.prior.models.mixture.tracks import (
 )
 
 DENSITIES = np.array([0.01, 0.045, 0.2, 0.9, 4.0, 15.0, 60.0, 400.0])
-"""m²/s³, process densities of the smoothers, stiff to loose, for a measurement of `MEASUREMENT_SIGMA` and a track whose
-variance is the joints' mean."""
+"""Process densities of the smoothers, stiff to loose, m²/s³. They are for measurements with `MEASUREMENT_SIGMA` and a
+track whose variance is the joints' mean."""
 
 MEASUREMENT_SIGMA = 0.02
-"""Metres along an axis, at full confidence. Only its ratio to the density matters."""
+"""Standard deviation of a fully confident measurement along an axis, metres. Only its ratio to the density matters."""
 
 EXPERTS = len(DENSITIES) + 2
-"""Number of experts: the smoothers; the multiple-model estimate; the raw joint, held at its last position while
-unseen."""
+"""Number of experts: the smoothers, the multiple-model estimate, and the raw joint (held while unobserved)."""
 
 MULTIPLE_MODEL = len(DENSITIES)
 RAW = EXPERTS - 1
-"""Indices of the last two"""
+"""Indices of the last two experts."""
 
 MEAN_FRAMES = 18
-"""Frames of the running means of distances and differences."""
+"""Length of the running means of distances and differences, frames."""
 
 SHARED = 9.0
-"""Sightings for which the noise of the body's tracks, their geometric mean, counts in that of each: within a few
-frames, one that moves fast looks like one that is noisy. 4 to 15 differ by 1 % at most (validation)."""
+"""Weight of the geometric mean of the tracks' noise in the noise of each track, observations. Over a few frames, a fast
+track looks like a noisy one. Values of 4 to 15 differ by at most 1 % (validation)."""
 
 LOG_FLOOR = 3e-4
-"""Metres, floor of lengths in logarithms."""
+"""Floor of lengths in logarithms, metres."""
 
 LAGS = ((1, 1), (2, 1), (3, 1), (2, 3))
-"""Order and spacing (frames) of the differences of raw positions, whose sizes distinguish noise from motion."""
+"""Order and spacing of the differences of raw positions, frames. Their sizes distinguish noise from motion."""
 _HISTORY = 7
 
 
 class Bank(NamedTuple):
-    """State of S bodies, J joints in as many tracks, M smoothers and K frames: the delay and the newest.
+    """State of S bodies, J joints in J tracks, M smoothers and K frames (the delay and the newest).
 
-    The first eight are of tracks, not of joints.
+    The first eight attributes belong to tracks, the others to joints.
 
     Attributes:
-        position: (S, J, M, K, 3) metres, of each frame given all measurements so far.
-        variance: (S, J, M, K) metres² along an axis, of that.
+        position: (S, J, M, K, 3) metres, position in each frame given all measurements so far.
+        variance: (S, J, M, K) metres² along an axis, variance of the position.
         with_position, with_velocity: (S, J, M, K) covariance of each frame's position with the newest position and
             velocity.
         velocity: (S, J, M, 3) m/s, and ``velocity_variance`` (S, J, M).
         squared_innovations: (S, J, M) sums, with forgetting, of the squared innovations normalised by their variance.
         log_variances: (S, J, M) sums, with forgetting, of the logarithms of the innovations' variance.
-        sightings: (S, J) number of terms of these sums, with forgetting.
-        raw: (S, J, K, 3) metres, the raw position, or the last one; NaN before the first.
-        unseen: (S, J, K) frames since the joint was last seen; -1 before the first observation.
-        confidence: (S, J, K).
-        recent: (S, J, 7, 3) metres, raw positions of the last frames; NaN where unseen.
+        sightings: (S, J) number of observations in these sums, with forgetting.
+        raw: (S, J, K, 3) metres, the raw position, or the last one while unobserved; NaN before the first.
+        unseen: (S, J, K) frames since the joint was last observed; -1 before the first observation.
+        confidence: (S, J, K) confidence of the observation.
+        recent: (S, J, 7, 3) metres, raw positions of the last frames; NaN where unobserved.
         distances: (S, J, M, 2) metres², running means of the squared distances between neighbouring experts.
-        noise: (S, J) metres², running mean of the squared distance of the raw joint to `features.NOISE_EXPERT`.
+        noise: (S, J) metres², running mean of the squared distance from the raw joint to `features.NOISE_EXPERT`.
         sizes: (S, J, 4) running means of the logarithms of the differences of `LAGS`.
         length: (S, J, 2) metres and metres², running mean and variance of the length of each joint's bone.
-        place: (S, J, 3) metres, the pose in the frame last described; NaN before.
-        age: (S, J, 3) frames that the running means of experts, differences and bones contain.
+        place: (S, J, 3) metres, pose in the frame that was last described; NaN before.
+        age: (S, J, 3) number of frames in the running means of experts, differences and bones.
         heading: (S, 2) cosine and sine of the body's heading.
-        modes: (S, J, J) orthogonal, joints by tracks: joints are ``modes @ tracks``.
+        modes: (S, J, J) orthogonal matrix, joints by tracks: joints are ``modes @ tracks``.
         eigenvalue: (S, J) variance of each track's acceleration, relative to the joints' mean.
-        member: (S, J) 1 if a joint is of the body, 0 if it is a track by itself.
-        streak: (S, J) frames in a row in which a joint was seen.
+        member: (S, J) 1 if a joint is in the body's modes, 0 if it is a track of its own.
+        streak: (S, J) number of consecutive frames in which a joint was observed.
     """
 
     position: NDArray[np.float64]
@@ -125,7 +124,7 @@ class Bank(NamedTuple):
 
 
 def new_bank(bodies: int, delay: int) -> Bank:
-    """An empty bank for ``bodies`` slots and a delay in frames."""
+    """Create an empty bank for ``bodies`` slots and a delay in frames."""
     experts, joints, frames = len(DENSITIES), len(PARENTS), delay + 1
     bank = Bank(
         position=np.empty((bodies, joints, experts, frames, 3)),
@@ -170,17 +169,17 @@ def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
 
 @njit(cache=True)
 def advance(bank, count, step, positions, confidence, densities, sigma, covariance):
-    """Take in a frame: predict and update all filters and smoothers.
+    """Process a frame: predict and update all filters and smoothers.
 
     Args:
         bank: a `Bank`.
-        count: frames taken in before.
-        step: seconds since the last.
-        positions: (S, J, 3) metres, NaN where unseen.
+        count: number of frames processed before.
+        step: seconds since the last frame.
+        positions: (S, J, 3) metres, NaN where unobserved.
         confidence: (S, J) 0 to 1.
         densities: `DENSITIES`.
         sigma: `MEASUREMENT_SIGMA`.
-        covariance: (J, J) of joints' accelerations along an axis, of mean variance 1 (`body_covariance`).
+        covariance: (J, J) covariance of joints' accelerations along an axis, with mean variance 1 (`body_covariance`).
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot, last = count % frames, (count - 1) % frames
@@ -213,7 +212,7 @@ def advance(bank, count, step, positions, confidence, densities, sigma, covarian
 
 @njit(cache=True)
 def _change_body(bank, s, members, covariance):
-    """Let these joints (J,) form the body, if they do not yet."""
+    """Form the body's modes from these joints (J,), unless they already do."""
     changed = False
     for j in range(len(members)):
         changed |= members[j] != (bank.member[s, j] > 0.0)
@@ -235,7 +234,7 @@ def _change_body(bank, s, members, covariance):
 
 @njit(cache=True)
 def _track(bank, s, slot, last, step, positions, confidence, seen, known, members, densities, sigma):
-    """Predict and update all filters of a body. A track of a single joint has that joint's number."""
+    """Predict and update all filters of a body. The track of a single joint has that joint's index."""
     joints, modes = len(seen), bank.modes[s]
     weight, variance, updated = np.empty(joints), np.empty(joints), np.empty(joints, dtype=np.bool_)
     measured, filled = np.zeros((joints, 3)), np.empty((joints, 3))
@@ -276,7 +275,7 @@ def _track(bank, s, slot, last, step, positions, confidence, seen, known, member
 
 @njit(cache=True)
 def _measure_differences(recent, sizes, age):
-    """Update the running means of the logarithms of `LAGS`' differences of raw positions (7, 3)."""
+    """Update the running means of the logarithms of the `LAGS` differences of raw positions (7, 3)."""
     n = _HISTORY - 1
     squares = np.zeros(4)
     for axis in range(3):
@@ -300,12 +299,11 @@ def multiple_model_weights(squared_innovations, log_variances, sightings, expect
     """Write the smoothers' weights in the multiple-model estimate of one track: their normalised likelihoods.
 
     Args:
-        squared_innovations: (M,), as of `Bank`.
-        log_variances: (M,), as of `Bank`.
-        sightings: as of `Bank`.
-        expected: the variance of the measurement noise as far as other tracks show it, in units of `MEASUREMENT_SIGMA`
-            squared.
-        counts: sightings for which it counts.
+        squared_innovations: (M,) sums of one track, see `Bank`.
+        log_variances: (M,) sums of one track, see `Bank`.
+        sightings: number of observations in these sums.
+        expected: variance of the measurement noise in the other tracks, in units of `MEASUREMENT_SIGMA` squared.
+        counts: weight of ``expected``, observations.
         weights: (M,), written; they sum to 1.
 
     Returns:

@@ -1,7 +1,7 @@
-"""Input features of the mixture's network: `FEATURES` numbers for each joint and frame; and its outputs' bounds.
+"""Input features of the mixture's network, `FEATURES` numbers per joint and frame, and bounds of its outputs.
 
-They are invariant under translation and rotation about the vertical: lengths, and vectors in the frame of the body's
-heading.
+The features are invariant under translation and rotation about the vertical: they are lengths, and vectors in the frame
+of the body's heading.
 """
 
 from __future__ import annotations
@@ -25,17 +25,16 @@ from steadypose.prior.models.mixture.bank import (
 from steadypose.prior.timing.rate import FPS
 
 POSE_EXPERT, NOISE_EXPERT, HEADING_EXPERT = 3, 4, 2
-"""Indices of the smoothers from which the body's pose is read, from whose residuals the noise is estimated, and from
-which the heading is read."""
+"""Indices of the smoothers that give the body's pose, the residuals for the noise estimate, and the heading."""
 
 SHORT_MEAN_FRAMES, BONE_MEAN_FRAMES = 3, 30
-"""Frames of the short running mean of distances, and of that of bone lengths; see `MEAN_FRAMES`."""
+"""Lengths of the short running mean of distances and of the running mean of bone lengths, frames; see `MEAN_FRAMES`."""
 
 SPEED_UNIT = 2.0
-"""m/s, unit of velocities."""
+"""Unit of velocities, m/s."""
 
 MAX_NOISE = 0.3
-"""Metres: a residual enters the noise estimate clipped at this, for frames with outliers that passed the gate."""
+"""Bound at which residuals are clipped in the noise estimate, metres; it limits outliers that passed the gate."""
 
 _CENTIMETRES = float(np.log(100.0))
 _DELAYS = (0, 1, 2, 4, 8)
@@ -49,53 +48,54 @@ _POSE = _BONE + 6
 _MULTIPLE_MODEL = _POSE + 6
 _SIGHTING = _MULTIPLE_MODEL + 6
 _DELAY = _SIGHTING + 6
-"""Offsets of the groups of features: log-distances between neighbouring experts (the smoothers by density, then the raw
-joint), three each; vectors between these; sizes of differences; bone; pose; multiple-model estimate; observation;
-delay."""
+"""Offsets of the groups of features. The groups are: three log-distances for each pair of neighbouring experts (the
+smoothers by density, then the raw joint), vectors between these experts, sizes of differences, bone, pose,
+multiple-model estimate, observation, and delay."""
 FEATURES = _DELAY + len(_DELAYS) + 1
-"""Features of each joint."""
+"""Number of features of a joint."""
 
 OUTPUTS = 2 * EXPERTS + 4
-"""Outputs of each joint: logits of the weights w, then b, the correction r (3), and the log standard deviation."""
+"""Number of outputs of a joint: logits of the weights w, then b, the correction r (3), the log standard deviation."""
 
 GATES = 3
-"""Gates of each joint, weights of the last frame's output: of w and b, of r, and of the deviation."""
+"""Number of gates of a joint, the weights of the last frame's output: for w and b, for r, and for the deviation."""
 
 REACH = 1.0
-"""Bound of each b: how far the estimate may leave the experts' convex hull."""
+"""Bound of each b, which limits how far the estimate may leave the experts' convex hull."""
 
 CORRECTION = 2.0
 """Bound of the correction along an axis, in units of the estimated noise."""
 
 COASTING = 0.1
-"""m/s: least growth of a joint's standard deviation with the time to its nearest observation."""
+"""Least growth of a joint's standard deviation with the time to its nearest observation, m/s."""
 
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
-"""Range of the natural logarithm of the standard deviation in millimetres."""
+"""Range of the natural logarithm of the standard deviation, which is in millimetres."""
 
 
 @njit(cache=True)
 def _log(square):
-    """Natural logarithm of the root of a square (m²), in centimetres."""
+    """Natural logarithm of a length in centimetres, given its square in m²."""
     return 0.5 * np.log(square + LOG_FLOOR**2) + _CENTIMETRES
 
 
 @njit(cache=True)
 def describe(bank, count, back, parents, whiteness, experts, features, scale, gap, between):
-    """Write the experts and features of a frame, and update the running means. Frames must come once, in order.
+    """Write the experts and features of a frame, and update the running means. Call it once per frame, in order.
 
     Args:
         bank: a `Bank`.
-        count: frames taken in, the newest included.
+        count: number of frames processed, including the newest.
         back: frames between the newest and this one.
-        parents: (J,) of the joints, the root's being 0.
-        whiteness: (S,) share of the noise that is known to be white, and so the same in all tracks; see `SHARED`.
-        experts: (S, J, EXPERTS, 3) metres, written; NaN of a joint not yet seen.
+        parents: (J,) parent of each joint; 0 for the root.
+        whiteness: (S,) share of the noise that is known to be white, and so equal in all tracks; see `SHARED`.
+        experts: (S, J, EXPERTS, 3) metres, written; NaN for a joint that has not been observed yet.
         features: (S, J, FEATURES) float32, written.
-        scale: (S,) metres along an axis, estimated noise of the body's joints; written.
-        gap: (S, J) frames to the nearest observation, before or after; 0 if seen in this frame, -1 if not yet; written.
+        scale: (S,) metres along an axis, estimated noise of the body's joints, written.
+        gap: (S, J) frames to the nearest observation, before or after, written; 0 if the joint is observed in this
+            frame, -1 if it has not been observed yet.
         between: (S, J) metres along an axis, standard deviation of the multiple-model estimate of a joint in a gap
-            between two observations, in a frame in which other joints of the body are seen; otherwise 0; written.
+            between two observations, if other joints of the body are observed in this frame; otherwise 0; written.
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot = (count - 1 - back) % frames
@@ -156,8 +156,10 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
 def _write_experts(
     tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, shared, experts, weights, noise
 ):
-    """Write the joints' experts (J, EXPERTS, 3), their smoothers' weights (J, M) and noise (J,); the noise of all
-    tracks counts for ``shared`` sightings in that of each."""
+    """Write the joints' experts (J, EXPERTS, 3), and the tracks' smoother weights (J, M) and noise (J,).
+
+    ``shared`` is the weight, in observations, of the noise of all tracks in that of each.
+    """
     joints = len(tracks)
     own, found = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     mean, logarithm, tracked = np.zeros((joints, 3)), 0.0, 0
@@ -199,9 +201,11 @@ def _write_experts(
 
 @njit(cache=True)
 def _deviation(experts, weights, variance, scales):
-    """Standard deviation of the multiple-model estimate, along an axis: of a mixture of normal distributions, the
-    weighted mean of the smoothers' variances, scaled by their innovations, and of their squared distances from the
-    mean."""
+    """Standard deviation of the multiple-model estimate along an axis, that of a mixture of normal distributions.
+
+    Its square is the weighted mean of the smoothers' variances, scaled by their innovations, plus that of their squared
+    distances from the mean.
+    """
     total = 0.0
     for m in range(_SMOOTHERS):
         total += weights[m] * (scales[m] * variance[m] + _square(experts[m], experts[MULTIPLE_MODEL]) / 3.0)
@@ -210,7 +214,7 @@ def _deviation(experts, weights, variance, scales):
 
 @njit(cache=True)
 def _neighbour(m):
-    """The expert next to smoother ``m``: the one of the next larger density, or the raw joint."""
+    """Return the expert next to smoother ``m``: the one with the next larger density, or the raw joint."""
     return m + 1 if m + 1 < _SMOOTHERS else RAW
 
 
@@ -222,7 +226,7 @@ def _square(a, b):
 
 @njit(cache=True)
 def _update_heading(experts, heading):
-    """Update the heading from hips and shoulders, as far as they are known."""
+    """Update the heading from the known ones of hips and shoulders."""
     x, y = 0.0, 0.0
     for left, right in ((_LEFT_HIP, _RIGHT_HIP), (_LEFT_SHOULDER, _RIGHT_SHOULDER)):
         a = experts[left, HEADING_EXPERT, 0] - experts[right, HEADING_EXPERT, 0]
@@ -237,7 +241,7 @@ def _update_heading(experts, heading):
 
 @njit(cache=True)
 def _write_vector(heading, x, y, z, unit, features, at):
-    """Write a vector in the body's frame, as asinh of multiples of ``unit``."""
+    """Write a vector in the frame of the heading, as asinh of its components divided by ``unit``."""
     features[at] = np.arcsinh((heading[0] * x + heading[1] * y) / unit)
     features[at + 1] = np.arcsinh((heading[0] * y - heading[1] * x) / unit)
     features[at + 2] = np.arcsinh(z / unit)
@@ -249,7 +253,7 @@ def _write_vector(heading, x, y, z, unit, features, at):
 
 @njit(cache=True)
 def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
-    """Observation and delay; all else is set to 0."""
+    """Observation and delay; sets all other features to 0."""
     for k in range(FEATURES):
         features[k] = 0.0
     for k, delay in enumerate(_DELAYS):
@@ -278,7 +282,7 @@ def _describe_experts(own, distances, heading, scale, features):
 
 @njit(cache=True)
 def _describe_multiple_model(own, weights, noise, heading, scale, features):
-    """Multiple-model estimate: relative to `POSE_EXPERT`, its mean log-density, and the noise that it estimates."""
+    """Multiple-model estimate: position relative to `POSE_EXPERT`, mean log-density, and estimated noise."""
     features[_MULTIPLE_MODEL] = _log(_square(own[MULTIPLE_MODEL], own[POSE_EXPERT]))
     features[_MULTIPLE_MODEL + 1] = 0.5 * np.log(noise + 1e-4) + np.log(MEASUREMENT_SIGMA / 0.01)
     features[_MULTIPLE_MODEL + 2] = 0.0
@@ -302,7 +306,7 @@ def _describe_pose(j, unseen_root, experts, place, heading, features):
 
 @njit(cache=True)
 def _describe_bone(j, parent, unseen, length, age, experts, heading, scale, features):
-    """The bone to the joint's parent: variance of its length, and its current deviation from the mean length."""
+    """Bone to the joint's parent: variance of its length, and current deviation from the mean length."""
     if parent == j or unseen[parent] < 0.0:
         return
     came, middle = 0.0, 0.0

@@ -1,6 +1,6 @@
-"""The mixture as the live node runs it: bank, features and network compiled, without torch.
+"""Live inference of the mixture: compiled bank, features and network, without torch.
 
-Every body is worked on by itself, so that what is found for it does not depend on the others, bit for bit.
+Each body is processed separately, so its results do not depend on other bodies, bit for bit.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class MixtureSmoother:
     """Fixed-lag smoother of the joints of several bodies: `MixtureNet` over a `Bank`.
 
     Attributes:
-        delay: frames.
-        white: (S,) share of each body's noise that is white, as of the newest frame.
+        delay: look-ahead, frames.
+        white: (S,) share of each body's noise that is white, estimated up to the newest frame.
     """
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
-        """``weights``: a weight set or a path, as of `load_weights`."""
+        """``weights`` is a weight set or a path, as in `load_weights`."""
         if delay < 0:
             raise ValueError(f"mixture: expected a delay of 0 frames or more, got {delay}")
         self.delay = delay
@@ -72,12 +72,12 @@ class MixtureSmoother:
     def update(
         self, positions: NDArray[np.float64], stamp_s: float, confidence: NDArray[np.float64] | None = None
     ) -> Smoothed | None:
-        """Take in a frame; the estimate of the frame ``delay`` before it, or None while there is none.
+        """Process a frame and return the estimate of the frame ``delay`` earlier, or None if there is none yet.
 
         Args:
-            positions: (S, 22, 3) metres, world-aligned with z up, NaN where unseen.
-            stamp_s: seconds of capture, increasing.
-            confidence: (S, 22) 0 to 1; 1 if left out.
+            positions: (S, 22, 3) metres, world-aligned with z up, NaN where unobserved.
+            stamp_s: time of capture, seconds, increasing.
+            confidence: (S, 22) 0 to 1; 1 if omitted.
         """
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
@@ -87,8 +87,7 @@ class MixtureSmoother:
         return self._answer(self.delay) if self._count > self.delay else None
 
     def skip(self, stamp_s: float) -> float:
-        """Take in a frame that has no body, when the last ``delay`` had none either; the stamp of the frame ``delay``
-        before it."""
+        """Process a frame without bodies after ``delay`` such frames; return the stamp of the first of these."""
         self._note(stamp_s)
         return self._stamps[0]
 
@@ -99,21 +98,21 @@ class MixtureSmoother:
         self._stamps = [*self._stamps[-self.delay :], stamp_s] if self.delay else [stamp_s]
 
     def flush(self) -> list[Smoothed]:
-        """The estimates that the delay still holds, oldest first; everything is then forgotten."""
+        """Return the estimates that the delay still holds, oldest first, and forget everything."""
         held = [self._answer(back) for back in reversed(range(min(self.delay, self._count)))]
         self.forget(np.ones(self._slots, dtype=bool))
         self._stamps, self._count = [], 0
         return held
 
     def forget(self, slot: NDArray[np.bool_]) -> None:
-        """Forget the bodies in these slots (S,), with the estimates that the delay still holds."""
+        """Forget the bodies in these slots (S,), including the estimates that the delay still holds."""
         forget(self._bank, slot)
         self._whiteness.forget(slot)
         for values in self._memory:
             values[slot] = 0.0
 
     def _answer(self, back: int) -> Smoothed:
-        """The estimate of the frame ``back`` before the newest."""
+        """Return the estimate of the frame ``back`` frames before the newest."""
         bank = self._bank
         described = self._experts, self._features, self._scale, self._gap, self._between
         describe(bank, self._count, back, PARENT, self.white, *described)
@@ -127,7 +126,7 @@ class MixtureSmoother:
 
 
 class _Network(NamedTuple):
-    """A trained `MixtureNet`: weights (in, out) and biases (rows, out), float32; biases added to one sum are merged."""
+    """A trained `MixtureNet`: float32 weights (in, out) and biases (rows, out). Biases of the same sum are merged."""
 
     mean: Floats
     per_deviation: Floats
@@ -152,8 +151,11 @@ class _Network(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """Recurrent state of S bodies: sums of `Memory` and their weights, of joints' features (S, 22, own) and of bodies'
-    (S, body); and the last outputs (S, 22, OUTPUTS)."""
+    """Recurrent state of S bodies.
+
+    It holds sums of `Memory` and their weights, of joints' features (S, 22, own) and of bodies' features (S, body), and
+    the last outputs (S, 22, OUTPUTS).
+    """
 
     own: Floats
     own_weight: Floats
@@ -188,7 +190,7 @@ def _network(name: str) -> _Network:
 
 @njit(cache=True)
 def _outputs(features, net, memory, slot):
-    """`MixtureNet` for one body and frame: (22, OUTPUTS) from features (22, FEATURES)."""
+    """Run `MixtureNet` for one body and frame: (22, OUTPUTS) from features (22, FEATURES)."""
     joints, zero, one = len(features), np.float32(0), np.float32(1)
     started = memory.body_weight[slot, 0] > zero
     normalised = np.empty_like(features)
@@ -226,7 +228,7 @@ def _outputs(features, net, memory, slot):
     return written
 
 
-# Loops in place of array expressions: numba compiles each of those, broadcasting and all, for a second or two.
+# Loops instead of array expressions, because numba takes a second or two to compile each broadcast expression.
 
 
 @njit(cache=True)
@@ -246,7 +248,7 @@ def _add(values, out):
 
 @njit(cache=True)
 def _remember(values, decay, total, weight, mean):
-    """One step of `Memory`: update the sums (N, F) of values and of their weights, and write the mean."""
+    """Run one step of `Memory`: update the sums (N, F) of values and of their weights, and write the mean."""
     one = np.float32(1)
     for i in range(len(values)):
         for k in range(values.shape[1]):
@@ -257,7 +259,7 @@ def _remember(values, decay, total, weight, mean):
 
 @njit(cache=True)
 def _concatenated(a, b, c):
-    """(N, A + B + C) of (N, A), (N, B) and (N, C)."""
+    """Concatenate (N, A), (N, B) and (N, C) to (N, A + B + C)."""
     out = np.empty((len(a), a.shape[1] + b.shape[1] + c.shape[1]), dtype=np.float32)
     for i in range(len(a)):
         for k in range(a.shape[1]):
@@ -271,7 +273,7 @@ def _concatenated(a, b, c):
 
 @njit(cache=True)
 def _mixed(outputs, experts, heading, scale, gap, between, fallback, places, sigma):
-    """`training.networks.mixture.answer` for one body; joints never seen are not written."""
+    """Compute `training.networks.mixture.answer` for one body. Joints that were never observed are not written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):

@@ -1,15 +1,15 @@
-"""The filters of a bank, on tracks: modes of the whole body, or joints by themselves.
+"""The filters of a bank, applied to tracks: modes of the whole body, or single joints.
 
-The joints of a body accelerate together. In the basis of the eigenvectors of the covariance of their accelerations,
-constant-velocity Kalman filters of the whole body fall apart into one for each mode, whose process density is in
-proportion to its eigenvalue; white noise of the joints is white noise of the modes. So a mode in which bodies hardly
-move is smoothed far, and one in which they do is followed.
+The joints of a body accelerate together. In the basis of the eigenvectors of their accelerations' covariance, a
+constant-velocity Kalman filter of the whole body separates into one filter per mode, with a process density
+proportional to the mode's eigenvalue. White noise of the joints is white noise of the modes. Modes in which bodies
+hardly move are therefore smoothed strongly, and modes in which they move are followed.
 
-That holds where all joints are seen equally well. A joint that is missed for a few frames stays in the body and is
-taken to be where it is predicted; of one of little confidence that is so in part. Modes then have the more noise, the
-less of them was measured. A joint missed for longer is a track by itself until it has settled, and
-the modes are those of the other joints: the eigenvectors of their part of the covariance. Of the states' covariance
-only the diagonal is kept through such a change.
+This holds if all joints are observed equally well. A joint that is missing for a few frames stays in the body, and its
+prediction replaces the measurement. For a joint of low confidence, this happens in part. The less of a mode is
+measured, the larger its noise. A joint that is missing for longer becomes a track of its own until it has settled, and
+the modes are then the eigenvectors of the other joints' part of the covariance. Such a change keeps only the diagonal
+of the states' covariance.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import load_weights
 
 MEMORY = 9
-"""Time constant of the likelihoods' exponential forgetting, in sightings: 5 to 15 differ by 3 % at most
+"""Time constant of the likelihoods' exponential forgetting, observations; 5 to 15 differ by at most 3 %
 (validation)."""
 
 MIN_SCALE = 1e-4
-"""Added to every normalised squared innovation: a floor of the noise at a hundredth of `MEASUREMENT_SIGMA`."""
+"""Term added to each normalised squared innovation; it limits the noise to at least 1 % of `MEASUREMENT_SIGMA`."""
 
 HELD, SETTLED = 3, 4
-"""Frames after which a joint that is missed leaves the body, and for which one is seen before it is of it."""
+"""Frames after which a missing joint leaves the body, and for which a joint must be observed to join it, frames."""
 
 MIN_EIGENVALUE = 1e-5
-"""Of a mode, relative to the joints' mean variance: no mode is rigid."""
+"""Least eigenvalue of a mode relative to the joints' mean variance, because no mode is rigid."""
 
 INITIAL_SPEED = 1.0
-"""m/s along an axis, standard deviation of a new joint's velocity."""
+"""Standard deviation of a new joint's velocity along an axis, m/s."""
 
 
 @cache
 def body_covariance(name: str = "default") -> Floats:
     """(22, 22) covariance of joints' accelerations along an axis, relative to their mean variance; read-only.
 
-    Six of its eigenvectors hold five sixths of it. It is the same for x, y and z, so that it does not depend on the
-    body's heading, and is learned from training motion (`training.recipes.moments`).
+    Six of its eigenvectors explain five sixths of it. It is equal for x, y and z, so that it does not depend on the
+    body's heading. It is learned from training motion (`training.recipes.moments`).
 
     Args:
-        name: a weight set or a path, as of `load_weights`.
+        name: a weight set or a path, as in `load_weights`.
     """
     covariance = load_weights(name, "body_modes")[0]["covariance"].astype(np.float64)
     covariance.flags.writeable = False
@@ -56,14 +56,16 @@ def body_covariance(name: str = "default") -> Floats:
 
 @njit(cache=True)
 def clipped(confidence):
-    """A confidence in the range in which noise is inversely proportional to it."""
+    """Clip a confidence to the range in which noise is inversely proportional to it."""
     return min(max(confidence, 0.1), 1.0)
 
 
 @njit(cache=True)
 def weigh(confidence, seen, members, weight):
-    """Write the weights (J,) of the joints' measurements, inverse to their variances, the largest in a body 1; return
-    the greatest confidence in it."""
+    """Write the weights (J,) of the joints' measurements, and return the largest confidence in the body.
+
+    Weights are inverse to the variances of the measurements; the largest in a body is 1.
+    """
     most = 0.0
     for j in range(len(weight)):
         if members[j] and seen[j]:
@@ -76,8 +78,7 @@ def weigh(confidence, seen, members, weight):
 
 @njit(cache=True)
 def fill_in(filled, modes, joint, share, tracks):
-    """Add to the tracks' measurements (J, 3) this share of where they (J, 3) predict a joint: so much of it is not
-    measured."""
+    """Add a joint's unmeasured ``share`` to the measurements ``filled`` (J, 3), as predicted by ``tracks`` (J, 3)."""
     for axis in range(3):
         ahead = 0.0
         for t in range(len(filled)):
@@ -88,16 +89,16 @@ def fill_in(filled, modes, joint, share, tracks):
 
 @njit(cache=True)
 def regroup(members, covariance, modes, eigenvalues):
-    """Let these joints form the body, and track all others by themselves.
+    """Form the body's modes from these joints, and give each other joint a track of its own.
 
     Args:
-        members: (J,) of the body.
-        covariance: (J, J) of joints' accelerations.
+        members: (J,) which joints form the body.
+        covariance: (J, J) covariance of joints' accelerations.
         modes: (J, J) joints by tracks, written.
-        eigenvalues: (J,) of the tracks, written.
+        eigenvalues: (J,) eigenvalues of the tracks, written.
 
     Returns:
-        (J, J) by which the tracks so far are to be multiplied.
+        (J, J) matrix that converts the previous tracks to the new ones.
     """
     joints, before, among = len(members), modes.copy(), np.flatnonzero(members)
     modes[:] = 0.0
@@ -129,7 +130,7 @@ def turn(values, by):
 def predict(
     position, own_variance, with_position, with_velocity, velocity, velocity_variance, slot, last, step, densities
 ):  # fmt: skip
-    """Predict all filters of a track into ``slot``."""
+    """Predict all filters of a track, and write the result to ``slot``."""
     for m in range(len(densities)):
         own = velocity_variance[m]
         growth, covariance = densities[m] * step, with_velocity[m, last]
@@ -148,7 +149,7 @@ def update(
     position, own_variance, with_position, with_velocity, velocity, velocity_variance, squared_innovations,
     log_variances, slot, known, measured, variance,
 ):  # fmt: skip
-    """Update one filter and its smoother; a track not ``known`` begins."""
+    """Update one filter and its smoother. A track that is not ``known`` is initialised."""
     frames = len(position)
     if not known:
         for k in range(frames):

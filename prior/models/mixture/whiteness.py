@@ -1,8 +1,9 @@
-"""How white a sensor's noise is, measured on bones, whose lengths no motion changes; and what follows for the mixture.
+"""Estimates the whiteness of a sensor's noise from bone lengths, which no motion changes, and selects the estimate by
+it.
 
-The network's weights were learned on the motion of a few people. In white noise nothing is known better than what the
-likelihood of innovations says, whoever moves, so there the multiple-model estimate takes over; noise that lasts, as
-real sensors have it, that estimate follows, and there the learned weights stay.
+The network's weights were learned from the motion of a few people. In white noise, no weights are better than the
+innovations' likelihoods, whoever moves, so the multiple-model estimate replaces the network's. Time-correlated noise,
+which real sensors have, misleads the multiple-model estimate, so the learned weights stay.
 """
 
 from __future__ import annotations
@@ -16,42 +17,42 @@ from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.compiled import median, njit
 
 MEMORY, LEAST = 45, 5
-"""Frames over which a bone's length is observed, and after which it counts."""
+"""Length of the running moments of a bone's length, and least number of observations, frames."""
 
 START, START_NEWEST = 5, 15
-"""Frames of observation that count as much as having none; the second without delay, where the network gains more on
-the multiple-model estimate."""
+"""Weight of the initial whiteness of 0, frames; the second without delay, where the network gains more over the
+multiple-model estimate."""
 
 SHARE = 1.5
-"""White share of the noise, times the square of the whiteness, and at most all. On validation people the whiteness is
-0.95 in independent noise, 0.5 in errors in depth that last for 0.05 s, and 0 to 0.1 on a Kinect, on MediaPipe and in
-noise of half a second."""
+"""Factor from the squared whiteness to the white share of the noise, which is at most 1. On validation people, the
+whiteness is 0.95 in independent noise, 0.5 in depth errors that last for 0.05 s, and 0 to 0.1 for a Kinect, for
+MediaPipe and in noise with a correlation time of half a second."""
 
 OWN = 3e-3
-"""Metres, standard deviation of the slow variation of a bone's length that is not taken for the sensor's: joints that
-stem from markers on skin are no rigid bones' ends (UI-PRMD's vary by 2.5 mm in the median)."""
+"""Standard deviation of slow variations of a bone's length that are not attributed to the sensor, metres. Joints
+computed from skin markers are not ends of rigid bones: in UI-PRMD, lengths vary by 2.5 mm (median)."""
 
 LARGE, LARGE_NEWEST = 0.014, 0.01
-"""Metres along an axis, white noise in which the multiple-model estimate has at most three quarters of the weight: all
-in much less, half in much more, where what is known of people helps; the second without delay."""
+"""White noise along an axis in which the weight of the multiple-model estimate is at most three quarters, metres; the
+second without delay. The limit is 1 in much smaller noise and 0.5 in much larger noise, where the network helps."""
 
 STILL = 1e-3
-"""Metres: a bone that varies by less has no noise to speak of."""
+"""Least standard deviation of a bone's length for its whiteness to count, metres."""
 
 _PARENTS = np.array(PARENTS[1:])
 
 
 class Whiteness:
-    """Keeps the moments of each bone's length: its variance, and those of its changes from frame to frame.
+    """Estimates whiteness from the variance of each bone's length and of its changes from frame to frame.
 
-    In white noise half the mean square of the change is the variance (von Neumann's ratio, 1941), and each change is
-    half undone by the next one. For noise with a correlation of r from frame to frame either ratio is 1 - r. A slow
-    variation adds to the variance alone, so that it lowers the first ratio; motion of a sensor that smooths lowers the
-    second one. The smaller of the two is the whiteness.
+    In white noise, half the mean squared change equals the variance (von Neumann's ratio, 1941), and the next change
+    undoes half of each change. In noise with a correlation of r from frame to frame, both ratios are 1 - r. Slow
+    variations increase only the variance and lower the first ratio. Motion seen by a sensor that smooths lowers the
+    second ratio. The whiteness is the smaller of the two.
 
     Args:
-        slots: bodies.
-        delay: frames.
+        slots: number of bodies.
+        delay: look-ahead of the smoother, frames.
     """
 
     def __init__(self, slots: int, delay: int) -> None:
@@ -67,11 +68,11 @@ class Whiteness:
             moment[slot] = 0.0
 
     def share(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take in joints (S, 22, 3) metres, NaN where unobserved; the share (S,) of the noise that is white."""
+        """Process joints (S, 22, 3) metres, NaN where unobserved; returns the white share (S,) of the noise."""
         return np.minimum(SHARE * self.update(positions) ** 2, 1.0)
 
     def update(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take in joints as `share`; whiteness (S,) from 0, lasting or not known, to 1."""
+        """Process joints like `share`; returns the whiteness (S,), from 0 (lasting or unknown noise) to 1."""
         white = np.zeros(len(positions))
         _update(
             positions, self._last, self._step, self._frames, self._mean, self._variance, self._change, self._pairs,
@@ -83,7 +84,7 @@ class Whiteness:
 
 @njit(cache=True)
 def _update(positions, last, step, frames, mean, variance, change, pairs, undone, white):
-    """Take joints (S, 22, 3) into the moments of `Whiteness`; writes the median ``white`` (S,) of bones' ratios."""
+    """Add joints (S, 22, 3) to the moments of `Whiteness`, and write the median ``white`` (S,) of the bones' ratios."""
     ratios = np.empty(len(_PARENTS))
     for slot in range(len(positions)):
         count = 0
@@ -107,7 +108,7 @@ def _update(positions, last, step, frames, mean, variance, change, pairs, undone
                 undone[slot, k] += (back - undone[slot, k]) / min(pairs[slot, k], MEMORY)
             if frames[slot, k] >= LEAST and variance[slot, k] > STILL**2:
                 opposed = min(max(undone[slot, k] / change[slot, k], 0.0), 1.0) if change[slot, k] > 0.0 else 0.0
-                # white noise may lie on top of a bone that varies by itself
+                # white noise may be added to a bone whose length varies itself
                 own = min(max(variance[slot, k] - change[slot, k], 0.0), OWN**2)
                 ratios[count] = min(change[slot, k] / max(variance[slot, k] - own, STILL**2), opposed)
                 count += 1
@@ -116,11 +117,11 @@ def _update(positions, last, step, frames, mean, variance, change, pairs, undone
 
 
 def fallback(white: NDArray[np.float64], scale: NDArray[np.float64], delay: int) -> NDArray[np.float64]:
-    """The share (S,) of the multiple-model estimate.
+    """Return the weight (S,) of the multiple-model estimate.
 
     Args:
         white: (S,) share of the noise that is white.
         scale: (S,) metres along an axis, estimated noise.
-        delay: frames.
+        delay: look-ahead of the smoother, frames.
     """
     return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / (LARGE if delay else LARGE_NEWEST))))

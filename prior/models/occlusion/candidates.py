@@ -1,10 +1,10 @@
-"""Candidates for the position of an occluded joint, and the features that weigh them: for training and live node.
+"""Candidates for the position of an occluded joint, and the features that weigh them, for training and live inference.
 
-The smoother lets a joint coast, which is right for a foot that stands. The completion network places it from the rest
-of the body, which is right for an arm that swings. A joint may keep its offset from the nearest joint seen, turned with
-the trunk, which is right for an arm that rests. And one that is seen again within the delay is smoothed by itself, over
-the gap (`bridge`). `training.recipes.occlusion` weighs the four by `FEATURES` numbers that are invariant to the body's
-position and heading.
+There are four candidates. The smoother lets the joint coast, which suits a standing foot. The completion network places
+it from the rest of the body, which suits a swinging arm. The joint may keep its offset from the nearest observed joint,
+turned with the trunk, which suits a resting arm. A joint that is observed again within the delay is smoothed over the
+gap from its own observations (`bridge`). The network of `training.recipes.occlusion` weighs the four from `FEATURES`
+numbers that are invariant to the body's position and heading.
 """
 
 from __future__ import annotations
@@ -21,41 +21,40 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 CANDIDATES = 4
-"""Coasting by the smoother, completed by the network, held in the body frame, and bridged, which is coasting where the
-joint is not seen again."""
+"""Number of candidates: coasting, completed, held in the body frame, and bridged (coasting if not observed again)."""
 
 FEATURES = 25
-"""Of each occluded joint."""
+"""Number of features of an occluded joint."""
 
 MIN_DISTANCE = 1e-3
-"""Metres added to distances before their logarithm is taken."""
+"""Offset added to distances before their logarithm is taken, metres."""
 MIN_SIGMA = 1e-4
-"""Metres, likewise, of standard deviations."""
+"""Offset added to standard deviations before their logarithm is taken, metres."""
 MIN_SPEED = 0.02
-"""m/s, likewise."""
+"""Offset added to speeds before their logarithm is taken, m/s."""
 MIN_HEIGHT = 0.01
-"""Metres, likewise, of heights above the lowest joint."""
+"""Offset added to heights above the lowest joint before their logarithm is taken, metres."""
 
 FADING = 0.4
-"""Weight of the newest speed in the running mean."""
+"""Weight of the newest speed in its running mean."""
 
 AVERAGING = 0.1
-"""Weight of the newest completion in the running mean of where a joint that was never seen is. Legs: an acceleration
-error of 2 instead of 17 mm/frame², at the same distance (validation)."""
+"""Weight of the newest completion in the running mean of the position of a joint that was never observed. For legs, it
+reduces the acceleration error from 17 to 2 mm/frame², with the same position error (validation)."""
 
 STANDING_SHARE = 0.5
-"""Share of a standing adult in where a joint is placed that was never observed. Half of it is nearer than either alone
-(validation: legs 221 mm completed, 221 standing, 209 their mean; an arm 204, 224, 193)."""
+"""Share of a standing adult in the position of a joint that was never observed. The mean is more accurate than either
+(validation: legs 221 mm completed, 221 mm standing, 209 mm their mean; an arm 204, 224, 193 mm)."""
 
 NEAR = 1e-3
-"""Bones per metre: of joints as many bones away, the nearest in space is taken."""
+"""Weight of distance relative to the number of bones in the nearest joint, bones per metre; it only breaks ties."""
 
 _MIRROR, _PARENT = np.asarray(MIRROR), np.maximum(PARENT, 0)
 _TRUNK = np.array([[J[f"{side}_{part}"] for side in ("left", "right")] for part in ("hip", "shoulder")])
 
 
 def _standing() -> Floats:
-    """(22, 3) metres: a generic adult who stands with the arms down."""
+    """(22, 3) metres, a generic adult who stands with the arms down."""
     pose = np.array(REST_POSITIONS)
     for shoulder, *arm in limbs(("shoulder", "elbow", "wrist")):
         pose[arm] = pose[shoulder] - np.outer(np.linalg.norm(pose[arm] - pose[shoulder], axis=1), (0.0, 0.0, 1.0))
@@ -69,11 +68,11 @@ class Past(NamedTuple):
     """State of S bodies.
 
     Attributes:
-        poses: (S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last seen; of one never seen,
-            that of the last frame; NaN before.
+        poses: (S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last observed; the last
+            frame's pose for a joint never observed; NaN before the first frame.
         place: (S, 22, 3) metres, the joints of the last frame; NaN before.
-        speed: (S, 22) m/s, running mean.
-        speed_seen: (S, 22) m/s, the same when the joint was last seen.
+        speed: (S, 22) m/s, running mean of each joint's speed.
+        speed_seen: (S, 22) m/s, its value when the joint was last observed.
     """
 
     poses: Floats
@@ -83,14 +82,14 @@ class Past(NamedTuple):
 
 
 def new_past(slots: int) -> Past:
-    """Of bodies of which nothing was seen so far."""
+    """Create the state of bodies before their first observation."""
     past = Past(np.empty((slots, 22, 22, 3)), np.empty((slots, 22, 3)), np.empty((slots, 22)), np.empty((slots, 22)))
     forget(past, np.ones(slots, dtype=bool))
     return past
 
 
 def forget(past: Past, slot: NDArray[np.bool_]) -> None:
-    """Start these slots (S,) afresh."""
+    """Reset these slots (S,)."""
     past.poses[slot] = past.place[slot] = np.nan
     past.speed[slot] = past.speed_seen[slot] = 0.0
 
@@ -101,11 +100,11 @@ def observe(past, slot, positions, sigma, unseen_s, held):
 
     Args:
         past: a `Past`.
-        slot: of the body.
-        positions: (22, 3) metres, of the smoother; NaN of joints never seen.
-        sigma: (22,) metres, along an axis.
-        unseen_s: (22,) seconds, 0 of a joint that is seen.
-        held: (22, 3) metres, written; NaN of joints never seen.
+        slot: slot of the body.
+        positions: (22, 3) metres, from the smoother; NaN for joints never observed.
+        sigma: (22,) metres along an axis, their standard deviations.
+        unseen_s: (22,) seconds since each joint was last observed; 0 for an observed joint.
+        held: (22, 3) metres, written; NaN for joints never observed.
     """
     poses, joints = past.poses[slot], len(positions)
     seen = np.empty(joints, dtype=np.bool_)
@@ -131,14 +130,14 @@ def observe(past, slot, positions, sigma, unseen_s, held):
 
 @njit(cache=True)
 def average(past, slot, never, completed, held):
-    """Update the running mean of where joints that were never seen are completed beside the others.
+    """Update the running mean of the completed positions of joints that were never observed, relative to the others.
 
     Args:
-        past: a `Past`, of which their poses are those of the frame before.
-        slot: of the body.
-        never: (22,) whether to.
-        completed: (22, 3) metres.
-        held: (22, 3) metres, as `observe` wrote it; of these joints, overwritten by the mean.
+        past: a `Past`, in which the poses of these joints are those of the frame before.
+        slot: slot of the body.
+        never: (22,) which joints were never observed.
+        completed: (22, 3) metres, the completion.
+        held: (22, 3) metres, written by `observe`; for these joints, overwritten by the mean.
     """
     poses, joints = past.poses[slot], len(never)
     for joint in range(joints):
@@ -156,13 +155,13 @@ def average(past, slot, never, completed, held):
 
 @njit(cache=True)
 def stand(never, positions, unseen_s, placed):
-    """Move joints that were never observed towards where a standing adult has them beside the others, in place.
+    """Move joints that were never observed towards their positions in a standing adult, in place.
 
     Args:
-        never: (22,) which.
-        positions: (22, 3) metres, of the smoother.
-        unseen_s: (22,) seconds, 0 of a joint that is observed.
-        placed: (22, 3) metres, where they are completed on average; of the others, left as it is.
+        never: (22,) which joints were never observed.
+        positions: (22, 3) metres, from the smoother.
+        unseen_s: (22,) seconds since each joint was last observed; 0 for an observed joint.
+        placed: (22, 3) metres, mean completed positions of these joints, changed; other joints do not change.
     """
     seen, standing = np.empty(len(never), dtype=np.bool_), np.empty((len(never), 3))
     for joint in range(len(never)):
@@ -177,7 +176,8 @@ def stand(never, positions, unseen_s, placed):
 
 @njit(cache=True)
 def _hold(joint, then, positions, seen, held):
-    """Write a joint at its offset from the nearest joint seen in the pose ``then`` (22, 3), turned with the trunk."""
+    """Write a joint at its offset from the nearest observed joint in the pose ``then`` (22, 3), turned with the
+    trunk."""
     nearest, least = -1, np.inf
     for other in range(len(seen)):
         if seen[other]:
@@ -201,7 +201,7 @@ def _hold(joint, then, positions, seen, held):
 
 @njit(cache=True)
 def turned(then, now, seen):
-    """Radians about z from pose ``then`` to ``now`` (22, 3), by the hips and shoulders that are ``seen`` (22,)."""
+    """Angle about z from pose ``then`` to ``now`` (22, 3), radians, from the observed hips and shoulders."""
     a, b = np.zeros(2), np.zeros(2)
     for part in range(len(_TRUNK)):
         left, right = _TRUNK[part]
@@ -215,17 +215,17 @@ def turned(then, now, seen):
 
 @njit(cache=True)
 def describe(past, slot, joint, candidates, sigmas, sigma, unseen_s, seen_later, features):
-    """Write the features (`FEATURES`,) of an occluded joint; after `observe` with the same frame.
+    """Write the features (`FEATURES`,) of an occluded joint. Call it after `observe` with the same frame.
 
     Args:
         past: a `Past`.
-        slot: of the body.
-        joint: its index.
-        candidates: (4, 3) metres, as `CANDIDATES` has them.
-        sigmas: (2,) metres, of the joint as it is completed and bridged.
-        sigma: (22,) metres, of the smoother.
-        unseen_s: (22,) seconds.
-        seen_later: whether it is seen again within the delay.
+        slot: slot of the body.
+        joint: index of the joint.
+        candidates: (4, 3) metres, in the order of `CANDIDATES`.
+        sigmas: (2,) metres, standard deviations of the completed and the bridged position.
+        sigma: (22,) metres, standard deviations of the smoother.
+        unseen_s: (22,) seconds since each joint was last observed.
+        seen_later: whether the joint is observed again within the delay.
         features: (`FEATURES`,) float32, written.
     """
     place, then = past.place[slot], past.poses[slot, joint]

@@ -1,4 +1,4 @@
-"""`OcclusionNet` without torch, row by row, so that no answer depends on the others."""
+"""Live inference of `OcclusionNet` without torch, row by row, so that no output depends on other rows."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from steadypose.prior.models.occlusion.candidates import CANDIDATES
 from steadypose.prior.models.weights import Arrays, load_weights
 
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 7.0
-"""Range of the logarithm of the network's standard deviation, in units of a millimetre."""
+"""Range of the natural logarithm of the network's standard deviation, which is in millimetres."""
 
 SIGMA_SCALE = 1.1
-"""Factor on the network's standard deviation, which holds for the people it was trained on: of others it is 1.0 to 1.3
-times too small, over occlusions of 0.2 s to 4 s (validation)."""
+"""Factor on the network's standard deviation, which is calibrated for training people. On validation people, the
+error-to-sigma ratio is 1.0 to 1.3 over occlusions of 0.2 s to 4 s."""
 
 
 class Occluded(NamedTuple):
@@ -26,7 +26,7 @@ class Occluded(NamedTuple):
     Attributes:
         body: (N,) row of the body.
         joint: (N,) index of the joint.
-        candidates: (N, 4, 3) metres, as `CANDIDATES` has them.
+        candidates: (N, 4, 3) metres, in the order of `CANDIDATES`.
         features: (N, `FEATURES`) float32.
     """
 
@@ -63,11 +63,11 @@ class LiveOcclusion:
 
     @classmethod
     def load(cls, weights: str) -> LiveOcclusion:
-        """From the weights of this name; raises as `load_weights`."""
+        """Load the weights of this name; raises like `load_weights`."""
         return cls(load_weights(weights, "occlusion")[0])
 
     def __call__(self, rows: Occluded) -> Weighed:
-        """The weighted mean of each joint's candidates, and its standard deviation."""
+        """Return the weighted mean of each joint's candidates, and its standard deviation."""
         weighed = Weighed(np.empty((len(rows.joint), 3)), np.empty(len(rows.joint)))
         _weigh(rows.features, rows.joint, rows.candidates, *self._layers, weighed.positions, weighed.sigma)
         return weighed
