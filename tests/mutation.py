@@ -1,28 +1,33 @@
 """Mutation testing: ``python -m tests.mutation FOLDER_OR_FILE... [--tests TESTS] [--sample N] [--seed S]``.
 
 A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
-place: it survived, and is printed. Unless tests are named, a mutant meets those aimed at its file: the ones that import
-it, or where none does, that import the modules that import it; then all of its room, none that is marked slow. The
-checkout stays as it is: mutants live in a copy. Exit status 0 if at least `GOAL` of the mutants were killed, and 1 if
-fewer were, or if the tests fail without any mutation.
+place: it survived, and is printed. Unless tests are named, a mutant meets those of its room and those aimed at its
+file: the ones that import it, or where none does, that import the modules that import it; none that is marked slow. Of
+these it meets the files that run the changed function, the quickest first. The checkout stays as it is: mutants live in
+a copy. Exit status 0 if at least `GOAL` of the mutants were killed, and 1 if fewer were, or if the tests fail without
+any mutation.
 """
 
 from __future__ import annotations
 
 import ast
 import copy
+import json
 import multiprocessing
 import os
 import random
 import shutil
 import sys
 import tempfile
+import threading
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
 
 import pytest
 
@@ -49,6 +54,9 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
     ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
 }  # fmt: skip
+SYMMETRIC = {"max", "min", "maximum", "minimum", "fmax", "fmin", "hypot"}
+"""Functions of two values in any order."""
+ROOMS = ("msgs", "prior", "training", "nodes", "benchmarks")
 
 
 @dataclass(frozen=True)
@@ -129,7 +137,7 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
                 changed.elts[0], changed.elts[-1] = last, first
                 yield changed
         case ast.Call(args=[first, *_, last]) if not any(isinstance(end, ast.Starred) for end in (first, last)):
-            if ast.dump(first) != ast.dump(last):
+            if ast.dump(first) != ast.dump(last) and ast.unparse(node.func).rpartition(".")[2] not in SYMMETRIC:
                 changed.args[0], changed.args[-1] = last, first
                 yield changed
         case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise():
@@ -148,7 +156,7 @@ def aimed_at(file: Path, root: Path = ROOT) -> list[str]:
     """
     modules = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
-        for room in ("msgs", "prior", "training", "nodes", "benchmarks")
+        for room in ROOMS
         for path in (root / room).rglob("*.py")
     }
     tests = {path: _imports(path) for path in sorted((root / "tests").rglob("test_*.py"))}
@@ -164,6 +172,11 @@ def aimed_at(file: Path, root: Path = ROOT) -> list[str]:
     raise ValueError(f"{file}: expected a module of the package that a test imports, if only by another")
 
 
+def of_room(file: Path, root: Path = ROOT) -> list[str]:
+    """Test files, relative to ``root``, of the room of a file."""
+    return [str(path.relative_to(root)) for path in sorted((root / "tests" / file.parent).glob("test_*.py"))]
+
+
 @cache
 def _imports(path: Path) -> set[str]:
     """Names without ``steadypose.``: of modules, and of what is taken from them."""
@@ -175,6 +188,72 @@ def _imports(path: Path) -> set[str]:
     return names
 
 
+class Part(NamedTuple):
+    """A function, a method, a constant, or what a module does as it is imported.
+
+    Attributes:
+        file: relative to the checkout.
+        first, last: lines from 1, decorators included.
+        ran: the first line of the function that runs it, 1 of a module.
+        names: that it defines; of a method, none.
+        uses: names that it mentions.
+        is_run: whether Python runs it; otherwise it is compiled, or a value, and shows in those that use it.
+    """
+
+    file: Path
+    first: int
+    last: int
+    ran: int
+    names: frozenset[str]
+    uses: frozenset[str]
+    is_run: bool
+
+
+@cache
+def parts(root: Path) -> list[Part]:
+    """All of the package; in a file, what is at a line comes before the module or class about it."""
+    found = []
+    for file in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
+        tree = ast.parse(file.read_text())
+        within = [child for node in tree.body if isinstance(node, ast.ClassDef) for child in node.body]
+        for node in (*within, *tree.body):
+            decorators = getattr(node, "decorator_list", [])
+            names, is_run = set[str](), not any("njit" in ast.unparse(decorator) for decorator in decorators)
+            if node in tree.body and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                names = {node.name}
+            elif node in tree.body and isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                names, is_run = set().union(*map(_names, targets)), False
+            first = min(part.lineno for part in (node, *decorators))
+            ran = first if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else 1
+            last = node.end_lineno or first
+            part = Part(file.relative_to(root), first, last, ran, frozenset(names), frozenset(_names(node)), is_run)
+            found.append(part)
+    return found
+
+
+def _names(node: ast.AST) -> set[str]:
+    every = [n for n in ast.walk(node) if isinstance(n, ast.Name | ast.Attribute)]
+    return {n.id if isinstance(n, ast.Name) else n.attr for n in every}
+
+
+def runs_of(mutant: Mutant, root: Path) -> set[tuple[str, int]]:
+    """Files and first lines of the code that runs, or uses, what is changed."""
+    every = parts(root)
+    waiting = [next(p for p in every if p.file == mutant.file and p.first <= mutant.line <= p.last)]
+    found, seen = set[tuple[str, int]](), set[Part]()
+    while waiting:
+        part = waiting.pop()
+        if part in seen:
+            continue
+        seen.add(part)
+        if part.is_run:
+            found.add((str(part.file), part.ran))
+        else:
+            waiting += [other for other in every if other.uses & part.names]
+    return found
+
+
 def copy_checkout(source: Path, target: Path) -> None:
     """All that tests of a checkout need, and nothing that they make."""
 
@@ -184,8 +263,14 @@ def copy_checkout(source: Path, target: Path) -> None:
     shutil.copytree(source, target, symlinks=True, ignore=left_out)
 
 
-def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bool:
+def passes(tests: Sequence[str], root: Path, limit_s: float | None = None, record: Path | None = None) -> bool:
     """Whether the tests pass on the copy of the checkout at ``root``; those that do not end in time do not.
+
+    Args:
+        tests: as pytest takes them.
+        root: of the copy.
+        limit_s: seconds that they may take.
+        record: a file for what they run: JSON of files and first lines of functions.
 
     Raises:
         ValueError: there are no such tests.
@@ -193,7 +278,7 @@ def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bo
     # forked from a process that has the libraries already: to import them takes longer than most tests
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(LIBRARIES)
-    child = context.Process(target=_run, args=(tests, root))
+    child = context.Process(target=_run, args=(tests, root, record))
     child.start()
     child.join(limit_s)
     if child.is_alive():
@@ -204,7 +289,7 @@ def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bo
     return child.exitcode == 0
 
 
-def _run(tests: Sequence[str], root: Path) -> None:
+def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     os.chdir(root)
@@ -212,7 +297,20 @@ def _run(tests: Sequence[str], root: Path) -> None:
     # no bytecode: two mutants of one second and one size would be taken for one another
     sys.dont_write_bytecode = True
     os.environ |= {"PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
-    sys.exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]))
+    ran: set[tuple[str, int]] = set()
+
+    def note(frame: FrameType, event: str, arg: object) -> None:
+        ran.add((frame.f_code.co_filename, frame.f_code.co_firstlineno))
+
+    if record:
+        threading.settrace(note)
+        sys.settrace(note)
+    status = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests])
+    sys.settrace(None)
+    if record:
+        within = [(Path(name).resolve(), line) for name, line in ran]
+        record.write_text(json.dumps([(str(f.relative_to(root)), n) for f, n in within if f.is_relative_to(root)]))
+    sys.exit(status)
 
 
 def main() -> int:
@@ -229,29 +327,24 @@ def main() -> int:
     drawn = random.Random(options.seed).sample(every, min(options.sample or len(every), len(every)))
     drawn.sort(key=lambda mutant: mutant.file)
     with tempfile.TemporaryDirectory() as temporary:
-        root = Path(temporary) / "checkout"
+        root, record = Path(temporary).resolve() / "checkout", Path(temporary) / "ran.json"
         copy_checkout(ROOT, root)
-        seconds: dict[tuple[str, ...], float] = {(): 0.0}
-
-        def survives(mutant: Mutant, tests: Sequence[str], limit_s: float) -> bool:
-            (root / mutant.file).write_bytes(mutant.source)
-            passed = passes(tests, root, limit_s)
-            (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
-            return passed
-
-        survived = 0
+        survived, seconds, ran = 0, dict[str, float](), dict[str, set[tuple[str, int]]]()
         for mutant in drawn:
-            aimed, folder = options.tests or aimed_at(mutant.file), Path("tests", mutant.file.parent)
-            room = [str(folder)] if not options.tests and (root / folder).is_dir() else []
-            elsewhere = [test for test in aimed if not room or folder not in Path(test).parents]
-            for tests in (tuple(elsewhere), tuple(room)):
-                if tests not in seconds:
+            tests = options.tests or [*aimed_at(mutant.file), *of_room(mutant.file)]
+            for test in dict.fromkeys(tests):
+                if test not in ran:
                     started = time.monotonic()
-                    if not passes(tests, root):
-                        sys.exit(f"the tests fail without any mutation, nothing can be said of them: {' '.join(tests)}")
-                    seconds[tests] = time.monotonic() - started
-            limit_s = 10.0 + 5.0 * max(seconds[tuple(elsewhere)], seconds[tuple(room)])
-            alive = all(survives(mutant, tests, limit_s) for tests in (aimed, room) if tests)
+                    if not passes([test], root, record=record):
+                        sys.exit(f"the tests fail without any mutation, nothing can be said of them: {test}")
+                    seconds[test] = time.monotonic() - started
+                    ran[test] = {(name, line) for name, line in json.loads(record.read_text())}
+            changed = runs_of(mutant, ROOT)
+            # what runs in other processes is not recorded
+            met = sorted({test for test in tests if ran[test] & changed} or set(tests), key=lambda test: seconds[test])
+            (root / mutant.file).write_bytes(mutant.source)
+            alive = passes(met, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in met))
+            (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
             survived += alive
             print("survived" if alive else "killed  ", mutant, flush=True)
     killed = len(drawn) - survived

@@ -1,0 +1,126 @@
+"""What is fused of smoother, completion and bones, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.inverse_kinematics import RIGID
+from steadypose.prior.body.skeleton import PARENT, J
+from steadypose.prior.clean.fuse import (
+    DERIVED_SIGMA,
+    Precision,
+    _align,
+    _between,
+    _completable,
+    _complete,
+    _merge,
+    _of_rigid,
+    _stated,
+    _unseen_of_subtree,
+    _weigh,
+)
+
+ELBOW, WRIST, SHOULDER, KNEE, PELVIS = (
+    J[name] for name in ("left_elbow", "left_wrist", "left_shoulder", "right_knee", "pelvis")
+)
+
+
+def unseen(**seconds: float) -> np.ndarray:
+    """(1, 22) all seen but these."""
+    found = np.zeros((1, 22))
+    for name, value in seconds.items():
+        found[0, J[name]] = value
+    return found
+
+
+def test_a_joint_is_held_by_whatever_is_seen_below_it() -> None:
+    found = _unseen_of_subtree(unseen(left_shoulder=2.0, left_elbow=1.0, left_wrist=0.5, right_elbow=1.0, pelvis=3.0))
+    assert found[0, [SHOULDER, ELBOW, WRIST]].tolist() == [0.5, 0.5, 0.5]
+    assert found[0, [J["right_elbow"], PELVIS]].tolist() == [0.0, 0.0]
+
+
+def test_variances_of_smoother_and_bias_add_and_those_of_the_prior_grow_until_it_fades() -> None:
+    deviation, held = np.full((1, 22), 0.03), unseen(left_wrist=2.0, left_elbow=9.0)
+    deviation[0, KNEE] = np.inf
+    seen, prior = _weigh(deviation, held, np.array([0.04]), 0.1, 0.25, 3.0)
+    assert seen[0, WRIST] == pytest.approx(1 / 0.05**2)
+    assert seen[0, KNEE] == 0.0
+    assert prior[0, [PELVIS, WRIST, ELBOW]] == pytest.approx(
+        [1 / 0.1**2, 1 / (0.1**2 + 0.5**2), 1 / (0.1**2 + 0.75**2)]
+    )
+    assert np.isfinite(_weigh(0 * deviation[:, :0], held[:, :0], np.zeros(1), 0.0, 0.0, 3.0)[0]).all()
+
+
+def test_a_body_is_put_where_most_that_is_seen_of_it_says() -> None:
+    seen, body = waving(1), waving(1) - [0.5, 0.2, -0.1]
+    seen[0, WRIST], seen[0, ELBOW] = np.nan, seen[0, ELBOW] + 0.3
+    precision = Precision(np.full((1, 22), 300.0), np.full((1, 22), 100.0))
+    precision.seen[0, [WRIST, ELBOW]] = 0.0, 25.0  # shares of 0.75, and of 0.2 of the elbow
+    well = _align(body, seen, precision)
+    off = 0.2 / (20 * 0.75 + 0.2) * 0.3
+    np.testing.assert_allclose(body, waving(1) + off, atol=1e-9)
+    assert np.flatnonzero(np.isnan(well[0, :, 0])).tolist() == sorted([ELBOW, WRIST])
+    np.testing.assert_array_equal(well[0, KNEE], seen[0, KNEE])
+
+
+def test_between_seen_joints_is_what_has_some_on_two_sides() -> None:
+    gone = unseen(left_elbow=np.inf, right_wrist=np.inf, spine2=np.inf, head=np.inf, left_knee=np.inf)
+    for end in ("left_ankle", "left_foot"):
+        gone[0, J[end]] = np.inf
+    between = _between(gone)[0]
+    assert [bool(between[J[name]]) for name in ("left_elbow", "spine2", "pelvis")] == [True, True, True]
+    assert [bool(between[J[name]]) for name in ("right_wrist", "head", "left_knee", "left_foot")] == [False] * 4
+    for joint in range(1, 22):  # seen or not, an inner joint lies between parent and child
+        assert _between(np.zeros((1, 22)))[0, joint] == (joint in PARENT[1:])
+    completed = waving(1)
+    completed[0, KNEE] = np.nan
+    gone[0, [WRIST, KNEE]] = 0.5
+    hidden = _completable(gone, completed)[0]
+    expected = {WRIST, *(J[name] for name in ("right_wrist", "head", "left_knee", "left_ankle", "left_foot"))}
+    assert set(np.flatnonzero(hidden)) == expected
+    assert not _completable(np.full((1, 22), 0.1), completed).any(), "a frame that was lost whole"
+
+
+def test_a_completion_is_moved_by_its_error_at_joints_seen_the_nearest_most() -> None:
+    seen, completed, body, hidden = waving(1), waving(1), np.zeros((1, 22, 3)), np.zeros((1, 22), dtype=bool)
+    hidden[0, WRIST] = True
+    completed[0, ELBOW, 0] -= 0.10
+    completed[0, SHOULDER, 0] -= 0.01
+    apart = np.full((1, 22), 1.0)
+    apart[0, [ELBOW, SHOULDER]] = 0.0  # the only ones seen: one bone from the wrist, and two
+    _complete(body, completed, seen, apart, hidden, np.full((1, 22), 7.0))
+    moved = body[0, WRIST] - completed[0, WRIST]
+    assert moved == pytest.approx([(0.10 / 4 + 0.01 / 9) / (1 / 4 + 1 / 9), 0.0, 0.0])
+    precise = np.full((1, 22), 7.0)
+    precise[0, SHOULDER] = 0.0
+    _complete(body, completed, seen, apart, hidden, precise)
+    assert body[0, WRIST, 0] - completed[0, WRIST, 0] == pytest.approx(0.10)
+    assert not np.delete(body, WRIST, axis=1).any()
+
+
+def test_a_hidden_joint_is_the_weighted_mean_and_one_that_is_here_stays() -> None:
+    body, seen, here = np.zeros((1, 22, 3)), np.ones((1, 22, 3)), np.zeros((1, 22), dtype=bool)
+    here[0, ELBOW], seen[0, KNEE] = True, np.nan
+    precision = Precision(np.full((1, 22), 300.0), np.full((1, 22), 100.0))
+    precision.seen[0, KNEE] = 0.0
+    variance = _merge(body, seen, here, precision)
+    assert body[0, [ELBOW, WRIST, KNEE], 0] == pytest.approx([1.0, 0.75, 0.0])
+    assert variance[0, [WRIST, KNEE]] == pytest.approx([1 / 400, 1 / 100])
+
+
+def test_of_a_hidden_joint_the_smaller_deviation_is_stated() -> None:
+    deviation, derived = np.full((1, 22), 0.01), np.zeros((1, 22), dtype=bool)
+    deviation[0, KNEE], derived[0, J["spine2"]] = np.inf, True
+    precision = Precision(np.full((1, 22), 1 / 0.2**2), np.full((1, 22), 1 / 0.3**2))
+    precision.prior[0, WRIST] = 1 / 0.1**2
+    found = _stated(unseen(left_wrist=0.5, left_elbow=0.5, spine2=np.inf), deviation, precision, derived)[0]
+    assert found[[SHOULDER, ELBOW, WRIST, KNEE]] == pytest.approx([0.01, 0.2, 0.1, 0.2])
+    assert found[J["spine2"]] == DERIVED_SIGMA
+
+
+def test_what_is_rigid_across_two_bones_varies_by_both() -> None:
+    variance = np.arange(22.0)[None]
+    for (end, start), found in zip(RIGID, _of_rigid(variance)[0], strict=True):
+        assert found == (end if PARENT[end] == start else end + start)
