@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import hashlib
 import json
 import multiprocessing
 import os
@@ -56,6 +57,7 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
 }  # fmt: skip
 SYMMETRIC = {"max", "min", "maximum", "minimum", "fmax", "fmin", "hypot"}
 """Functions of two values in any order."""
+LOOPS = ROOT / "src" / "steadypose" / "__pycache__" / "loops_of_mutants"
 ROOMS = ("msgs", "prior", "training", "nodes", "benchmarks")
 
 
@@ -297,6 +299,7 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
     # no bytecode: two mutants of one second and one size would be taken for one another
     sys.dont_write_bytecode = True
     os.environ |= {"PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(LOOPS))  # only loops that are changed are compiled
     ran: set[tuple[str, int]] = set()
 
     def note(frame: FrameType, event: str, arg: object) -> None:
@@ -313,6 +316,23 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
     sys.exit(status)
 
 
+class Met(NamedTuple):
+    """What a test file does without any mutation.
+
+    Attributes:
+        seconds: that it takes.
+        ran: files and first lines of functions.
+    """
+
+    seconds: float
+    ran: list[list[str | int]]
+
+
+def _digest(path: Path) -> str:
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
 def main() -> int:
     """Mutate, test, count."""
     parser = ArgumentParser("python -m tests.mutation", description=__doc__)
@@ -320,6 +340,7 @@ def main() -> int:
     parser.add_argument("--tests", nargs="+", help="what pytest is to run; those aimed at each file if left out")
     parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all of them if left out")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kept", type=Path, help="a file for what unchanged tests run, made by the first call with it")
     options = parser.parse_args()
     paths = [path.resolve() for path in options.code]
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
@@ -329,19 +350,25 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         root, record = Path(temporary).resolve() / "checkout", Path(temporary) / "ran.json"
         copy_checkout(ROOT, root)
-        survived, seconds, ran = 0, dict[str, float](), dict[str, set[tuple[str, int]]]()
+        survived, met_before = 0, dict[str, Met]()
+        if options.kept and options.kept.is_file():
+            met_before = {key: Met(*value) for key, value in json.loads(options.kept.read_text()).items()}
         for mutant in drawn:
             tests = options.tests or [*aimed_at(mutant.file), *of_room(mutant.file)]
-            for test in dict.fromkeys(tests):
-                if test not in ran:
+            known = {test: f"{test} {_digest(root / test.partition('::')[0])}" for test in tests}
+            for test, key in known.items():
+                if key not in met_before:
                     started = time.monotonic()
                     if not passes([test], root, record=record):
                         sys.exit(f"the tests fail without any mutation, nothing can be said of them: {test}")
-                    seconds[test] = time.monotonic() - started
-                    ran[test] = {(name, line) for name, line in json.loads(record.read_text())}
-            changed = runs_of(mutant, ROOT)
+                    met_before[key] = Met(time.monotonic() - started, json.loads(record.read_text()))
+                    if options.kept:
+                        options.kept.write_text(json.dumps(met_before))
+            seconds = {test: met_before[key].seconds for test, key in known.items()}
+            changed = [list(place) for place in runs_of(mutant, ROOT)]
             # what runs in other processes is not recorded
-            met = sorted({test for test in tests if ran[test] & changed} or set(tests), key=lambda test: seconds[test])
+            met = [test for test, key in known.items() if any(place in met_before[key].ran for place in changed)]
+            met = sorted(met or known, key=seconds.__getitem__)
             (root / mutant.file).write_bytes(mutant.source)
             alive = passes(met, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in met))
             (root / mutant.file).write_bytes((ROOT / mutant.file).read_bytes())
