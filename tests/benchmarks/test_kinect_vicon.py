@@ -1,14 +1,30 @@
 import dataclasses
 from functools import partial
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
-from steadypose.benchmarks.bench import Tuned
-from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, align, deviation, learn_offset, score, summary
-from steadypose.benchmarks.studies.kinect_methods import best_without, run_filter
+from steadypose.benchmarks.bench import Bench, Tuned
+from steadypose.benchmarks.studies import kinect_methods
+from steadypose.benchmarks.studies.kinect_clips import (
+    SCORED,
+    Clip,
+    align,
+    deviation,
+    learn_offset,
+    quick_score,
+    score,
+    summary,
+)
+from steadypose.benchmarks.studies.kinect_methods import Kinect, Stated, best_without, run_filter
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import J
+from steadypose.training.loop import TrainingOptions
 
 REST = np.array(
     [[0.0, 0.0, 1.6]]
@@ -110,6 +126,67 @@ def test_a_filter_is_chosen_by_the_others_figures() -> None:
     found = Tuned({"density": 0.5}, tried)
     assert [best_without(s, found, baseline)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
     assert best_without("s01", Tuned({}, []), baseline) == {}
+
+
+def test_a_filter_of_whole_bodies_gets_all_joints_and_its_scored_ones_are_kept() -> None:
+    kinect = np.random.default_rng(0).normal(0, 0.4, (9, 22, 3))
+    one = clip(0, 9)._replace(kinect=kinect)
+    (answer,) = run_filter([one], lambda seen, stamps_s: seen + stamps_s[:, None, None, None], whole_body=True)
+    expected = to_canonical(KINECT22, kinect)[0][:, [J[name] for name in SCORED]]
+    np.testing.assert_allclose(answer, expected + (np.arange(9) / 30)[:, None, None])
+
+
+def test_a_search_has_each_persons_figures_and_their_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    people = ("s07", "s08", "s08")
+    clips = [clip(n, 20 + n)._replace(subject=who, name=f"{n}") for n, who in enumerate(people)]
+    baseline = Baseline("filter", lambda seen, _, delay, by: seen + delay * by, None, {"by": (0.1, 10.0)})
+    kinect = Kinect(cast(Bench, None), Path("nowhere.npz"), clips, clips)
+    monkeypatch.setattr(kinect_methods, "tune", lambda bench, evaluate, *_: evaluate(baseline, 2, {"by": 0.5}))
+    found: dict = kinect.tuned(clips)
+    own = {who: [c for c in clips if c.subject == who] for who in ("s07", "s08")}
+    for name in ("position_mm", "acceleration_mm"):
+        each = [quick_score(some, [c.raw + 1.0 for c in some])[name] for some in own.values()]
+        assert [found[f"s07 {name}"], found[f"s08 {name}"]] == pytest.approx(each)
+        assert found[name] == pytest.approx(np.mean(each), abs=1e-3)
+
+
+def test_what_is_the_same_for_all_is_run_once_and_each_clip_gets_its_own() -> None:
+    clips = [clip(n, 12)._replace(name=f"{n}") for n in range(3)]
+    kinect, asked = Kinect(cast(Bench, None), Path("nowhere.npz"), clips, clips), []
+
+    def run(some: list[Clip], stated: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
+        asked.append(len(some))
+        told = [Stated(one.raw[..., 0], one.raw[:, 0, 0], one.raw[:, 0, 0] > 0) for one in some]
+        return [one.raw for one in some], told if stated else None
+
+    for stated in (True, False, True):
+        found, told = kinect._once(clips[2:0:-1], (stated,), partial(run, stated=stated))
+        assert [answer is one.raw for answer, one in zip(found, clips[2:0:-1], strict=True)] == [True, True]
+        assert (told is not None) == stated
+        assert told is None or np.array_equal(told[0].sigma, clips[2].raw[..., 0])
+    assert asked == [3, 3]
+
+
+@pytest.mark.parametrize(("quick", "steps"), [(True, 40), (False, 4000)])
+def test_a_correction_is_learned_of_the_others_once(
+    quick: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple] = []
+
+    def train(options: TrainingOptions, subjects: tuple[str, ...]) -> None:
+        asked.append((options.data, options.iterations, subjects))
+        (path := options.path("correction")).parent.mkdir(parents=True)
+        path.touch()
+
+    monkeypatch.setattr(kinect_methods, "ROOT", tmp_path)
+    monkeypatch.setattr(kinect_methods, "train_correction", train)
+    (data := tmp_path / "pairs.npz").touch()
+    bench = Bench(quick=quick, mocap=None, data=data, progress=Progress(disable=True))
+    clips = [clip(n, 12)._replace(subject=who) for n, who in enumerate(("s03", "s01", "s02", "s01"))]
+    kinect = Kinect(bench, data, clips, clips)
+    assert kinect.correction("s01").is_file()
+    assert kinect.correction("s01") == kinect.correction("s01") != kinect.correction("s02")
+    assert asked == [(data, steps, ("s03", "s02")), (data, steps, ("s03", "s01"))]
 
 
 def test_what_moves_is_what_is_left_without_the_clips_own_constant_offset() -> None:

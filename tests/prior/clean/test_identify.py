@@ -3,10 +3,12 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from tests.helpers.bodies import PERIOD_NS, raw, waving
 from tests.helpers.crossings import MANIFEST, all_hidden, score, watch
 
-from steadypose.prior.clean.identify import Identify, IdentifySettings
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.identify import Identify, IdentifySettings, _bone_lengths, _place_score, _unobserved
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.sim.streams import read_manifest
@@ -101,6 +103,52 @@ def test_what_a_hostile_source_sends_is_survived_and_counted() -> None:
     assert ids(identify, 5, crowd[0]) == [None]  # stamps went back: a new stream
     assert ids(identify, 10**9, crowd[0]) == [None]  # and far ahead
     assert [ids(identify, 10**9 + 1 + k, crowd[0])[0] for k in range(9)][-1] == 9, "ids are never given again"
+
+
+def test_a_place_is_as_likely_as_normal_errors_make_it_against_somebody_new() -> None:
+    """Errors of 0.1 m a frame, in height of 0.3 m at most besides; a new person in a hundred cubic metres."""
+    away, across, up = np.array([0.2, -0.1, 0.15]), np.hypot(0.4, 0.1), np.hypot(0.3, 0.1)
+    expected = norm(0, [across, across, up]).logpdf(away).sum() - np.log(0.01)
+    assert _place_score(away, np.float64(0.4)) == pytest.approx(expected)
+    assert _place_score(np.full(3, np.nan), np.float64(0.4)) == -np.inf
+
+
+def test_who_is_out_of_sight_is_expected_to_lose_the_velocity_within_a_second() -> None:
+    """A velocity of 0.6 m/s along an axis that is forgotten in 1 s: its covariance, integrated twice."""
+    seconds = np.array([0.5, 3.0])
+    expected, sigma = _unobserved(np.zeros((2, 3)), seconds[:, None] * [1.0, 0.0, 0.0], np.full(2, 99.0), seconds)
+    np.testing.assert_allclose(expected[:, 0], 1.0 - np.exp(-seconds))
+    for stated, duration in zip(sigma, seconds, strict=True):
+        t = np.linspace(0.0, duration, 1001)
+        spread = 0.36 * np.exp(-np.abs(t[:, None] - t)).mean() * duration**2
+        assert stated == pytest.approx(np.sqrt(0.1**2 + spread), rel=1e-3)
+    assert _unobserved(np.zeros((1, 3)), np.zeros((1, 3)), np.full(1, 0.02), np.ones(1))[1] == [0.02]
+
+
+def test_bones_are_the_mean_of_both_sides_that_are_well_seen_and_no_giants() -> None:
+    body, confidence = SHORT[0].copy(), np.ones((1, 22))
+    whole = _bone_lengths(body[None], confidence)[0]
+    generic = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])
+    np.testing.assert_allclose(whole, 0.9 * generic, rtol=0.06)
+    body[J["left_ankle"]] += (body[J["left_ankle"]] - body[J["left_knee"]]) * 0.2  # a fifth longer on one side
+    assert _bone_lengths(body[None], confidence)[0] == pytest.approx(whole * [1.0, 1.1, 1.0, 1.0, 1.0, 1.0])
+    confidence[0, J["left_ankle"]] = 0.29
+    body[J["right_wrist"]] += 0.6
+    assert _bone_lengths(body[None], confidence)[0] == pytest.approx(whole)
+    confidence[0, [J["left_hip"], J["right_hip"]]] = 0.0
+    assert np.flatnonzero(np.isnan(_bone_lengths(body[None], confidence)[0])).tolist() == [0]
+
+
+def test_longer_bones_are_somebody_elses_by_their_likelihood() -> None:
+    """A length errs by 5 cm in a second, people differ by a tenth of it; one bone never tells by more than e^3."""
+    identify = stage()
+    identify._lengths[:2], identify._lengths_s[:2] = 0.4, [[4.0] * 6, [0.5] * 6]
+    identify._lengths_s[:, 2:] = 0.0  # of two bones alone
+    identify._lengths[1, :2] = 0.45, 1.4
+    same = 0.05**2 / 4 + 0.05**2
+    found = identify._length_score(np.array([0]), np.array([1]))[0, 0]
+    other = same + 2 * (0.1 * 0.415) ** 2
+    assert found == pytest.approx(norm(0, same**0.5).logpdf(0.05) - norm(0, other**0.5).logpdf(0.05) - 3.0)
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,15 @@ def test_who_falls_silent_is_forgotten_and_may_come_back() -> None:
     assert {len(c.bodies) for c in answers["gone"]} <= {0, 1}
 
 
+def test_who_sends_a_wrong_stamp_is_not_silent() -> None:
+    slow = kiosk("slow", 50)[::7]
+    slow[3][1].stamp_ns = 0
+    slow[4] = slow[4][0] + 80_000_000, slow[4][1]
+    _, batch = serve(kiosk("steady", 50), slow)
+    assert batch.counters["stamp_outlier"] == 1
+    assert batch.counters["stream_silent"] == 0
+
+
 def test_all_fall_silent_and_come_back() -> None:
     arrivals = kiosk("a", 90)
     answers, _ = serve(arrivals[:20] + arrivals[60:])

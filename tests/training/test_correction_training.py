@@ -1,0 +1,115 @@
+"""What a sensor's correction is trained on, and that it learns it of whoever is there, left as right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.helpers.bodies import waving
+
+from steadypose.prior.body.kinematics import yaw_matrix
+from steadypose.prior.body.layouts import KINECT22, to_canonical
+from steadypose.prior.body.skeleton import J
+from steadypose.prior.models.sensor_bias import FEATURES, HISTORY, LiveCorrection, features, trunk_frame
+from steadypose.training.data.ui_prmd import KinectPair
+from steadypose.training.loop import TrainingOptions
+from steadypose.training.recipes import sensor_bias
+from steadypose.training.recipes.sensor_bias import SensorTake, train_correction, train_sensor
+
+BIAS = np.zeros((22, 3))
+BIAS[J["left_wrist"]], BIAS[J["right_wrist"]], BIAS[J["head"]] = [0.06, 0.04, 0], [0.06, -0.04, 0], [0, 0, 0.03]
+"""Metres in the trunk's frame, what must be added; the same in a mirror."""
+TURN, SHIFT, CAMERA = yaw_matrix(0.7), np.array([2.0, -1.0, 0.3]), np.array([3.0, 0.5, 1.2])
+
+
+def observed(truth: np.ndarray) -> np.ndarray:
+    return truth - BIAS @ trunk_frame(truth).swapaxes(-1, -2)
+
+
+def test_what_is_missing_is_in_the_trunks_frame_of_the_pose_beside_it() -> None:
+    truth = np.repeat(waving(1) @ TURN.T, 20, axis=0)
+    elsewhere = (truth - SHIFT) @ TURN
+    x, missing = sensor_bias._features_and_missing(observed(truth), elsewhere, (TURN, SHIFT), CAMERA, 30.0)
+    np.testing.assert_allclose(missing, np.tile(BIAS, (20, 1, 1)), atol=1e-9)
+    still = np.repeat(observed(truth)[None], len(HISTORY), axis=0)
+    np.testing.assert_allclose(x, features(still, CAMERA), atol=1e-9)
+
+
+def test_a_kinect_is_moved_to_vicon_by_joints_that_both_have_throughout() -> None:
+    kinect = np.random.default_rng(0).normal(0.0, 0.4, (22, 3)) + np.zeros((20, 1, 1))
+    seen = to_canonical(KINECT22, kinect)[0]
+    vicon, wrist = seen @ TURN.T + SHIFT, J["left_wrist"]
+    vicon[:, wrist] = (seen[:, wrist] + [0.0, 0.2, 0.0]) @ TURN.T + SHIFT
+    vicon[3, wrist] = np.nan
+    missing = sensor_bias._clip(KinectPair("a", "s01", "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3))))[1]
+    others = np.delete(missing, wrist, axis=1)
+    np.testing.assert_allclose(others[np.isfinite(others)], 0.0, atol=1e-9)
+    np.testing.assert_allclose(missing[5, wrist], [0.0, 0.2, 0.0] @ trunk_frame(seen)[5], atol=1e-9)
+
+
+def test_in_a_tenth_of_the_frames_a_fifth_of_the_joints_is_hidden_whole() -> None:
+    x = torch.ones(20_000, FEATURES)
+    found = sensor_bias._hide(x, np.random.default_rng(0))
+    history, middle, seen = found[:, : 66 * len(HISTORY)], found[:, 66 * len(HISTORY) : -22], found[:, -22:]
+    assert torch.equal(middle, x[:, 66 * len(HISTORY) : -22])
+    hidden = seen == 0
+    of_history = history.isnan().reshape(len(x), len(HISTORY), 22, 3)
+    assert torch.equal(of_history, hidden[:, None, :, None].expand_as(of_history))
+    assert float(hidden.any(dim=1).double().mean()) == pytest.approx(0.1, rel=0.1)
+    assert float(hidden.double().mean()) == pytest.approx(0.02, rel=0.1)
+
+
+def test_the_error_is_the_mean_distance_of_joints_that_the_reference_has() -> None:
+    truth = torch.zeros(2, 22, 3)
+    truth[0, 3, 1] = torch.nan
+    estimate = torch.zeros(2, 22, 3)
+    estimate[0, 3], estimate[1, 5] = 9.0, torch.tensor([0.3, 0.0, 0.4])
+    assert float(sensor_bias._error(estimate, truth)) == pytest.approx(0.5 / 43, rel=1e-3)
+
+
+def takes() -> list[SensorTake]:
+    """Of two people, one turned; a foot is never seen, a knee unknown to the reference, a hip not seen at first."""
+    found = []
+    for person, turn in (("ann", 0.0), ("bob", 1.5)):
+        truth = waving(90, 1.0 if person == "ann" else 0.93) @ yaw_matrix(turn).T
+        seen = observed(truth)
+        seen[:, J["left_foot"]], seen[:4, J["left_hip"]] = np.nan, np.nan
+        truth[:, J["right_knee"]] = np.nan
+        found.append(SensorTake(person, seen, CAMERA, truth))
+    return found
+
+
+def test_a_bias_is_learned_of_either_side_and_the_card_says_of_whom(tmp_path: Path) -> None:
+    path = train_sensor([*takes(), takes()[0]], TrainingOptions(tmp_path, tmp_path, "mine", iterations=120))
+    assert path == TrainingOptions(tmp_path, tmp_path, "mine").path("correction")
+    card = path.with_suffix(".md").read_text()
+    for words in ("error of the sensor mine", "3 recordings of 2 people beside", "that of the recordings"):
+        assert words in card
+    x, missing = sensor_bias._take(takes()[1])
+    there = np.isfinite(x[:, 0])
+    assert there.sum() == len(x) - 4
+    learned = LiveCorrection.load(str(path), int(there.sum()))(x[there])
+    known = np.delete(np.arange(22), [J["left_foot"], J["right_knee"]])
+    np.testing.assert_allclose(learned.mean(axis=0)[known], missing[there].mean(axis=0)[known], atol=0.01)
+
+
+def test_a_kinects_correction_is_of_the_subjects_that_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[tuple[Path, str]] = []
+
+    def load(data: Path, subjects: tuple[str, ...]) -> list[KinectPair]:
+        read.extend((data, subject) for subject in subjects)
+        kinect = np.random.default_rng(len(read)).normal(0.0, 0.4, (22, 3)) + np.zeros((20, 1, 1))
+        vicon = to_canonical(KINECT22, kinect)[0]
+        return [KinectPair("a", subjects[0], "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3)))]
+
+    monkeypatch.setattr(sensor_bias, "load_pairs", load)
+    data = tmp_path / "of_this_test.npz"
+    path = train_correction(TrainingOptions(data, tmp_path, "mine", iterations=1), ("s05", "s02"))
+    assert read == [(data, "s05"), (data, "s02")]
+    card = path.with_suffix(".md").read_text()
+    for words in ("systematic error of a Kinect v2", "Kinect beside Vicon: s05, s02", "Apache-2.0"):
+        assert words in card
