@@ -85,6 +85,24 @@ def test_a_joint_is_frozen_that_repeats_itself_while_others_shake() -> None:
     assert not frozen_joints(seen)[0].any()
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.005])
+def test_what_rests_beside_steady_motion_is_frozen_only_if_the_sensor_has_noise(sigma: float) -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(0.01, 0.03, (22, 3)) * np.arange(50)[:, None, None] + rng.normal(0.0, sigma, (50, 22, 3))
+    seen[:, WRIST] = seen[0, WRIST]
+    assert np.flatnonzero(frozen_joints(seen[None])[0]).tolist() == ([WRIST] if sigma else [])
+
+
+@pytest.mark.parametrize("rounds", [False, True])
+def test_a_sensor_rounds_whose_joints_repeat_coordinates_in_the_frames_that_have_them(rounds: bool) -> None:
+    seen = np.random.default_rng(0).normal(0.0, 0.005, (51, 22, 3))
+    seen[::3, :10] = np.nan
+    seen[:, WRIST] = seen[0, WRIST]
+    if rounds:
+        seen[2::3, :10, :2] = seen[1::3, :10, :2]
+    assert np.flatnonzero(frozen_joints(seen[None])[0]).tolist() == ([] if rounds else [WRIST])
+
+
 def test_a_body_that_is_repeated_whole_has_no_joint_frozen() -> None:
     """A camera of 15 Hz on a grid of 30, or one that pauses."""
     rng = np.random.default_rng(0)
