@@ -58,3 +58,10 @@ def test_hidden_joints_and_a_forgotten_body_count_for_nothing() -> None:
     estimator.forget(np.array([True]))
     assert left_out(seen[:1], estimator=estimator) == 0.0
     assert DepthError(2).update(None, np.zeros(2)).tolist() == [0.0, 0.0]
+
+
+def test_an_error_that_has_ended_is_forgotten_within_some_ten_seconds() -> None:
+    seen, estimator = waving(FRAMES) + noise(DEPTH), DepthError(1)
+    during = left_out(seen, estimator=estimator)
+    after = left_out(waving(FRAMES), estimator=estimator)
+    assert (after / during) ** 2 == pytest.approx(np.exp(-1.0), rel=0.25)
