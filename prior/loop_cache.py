@@ -1,12 +1,11 @@
-"""Compiled loops on disk: found again by what they were compiled from, checked by digest, and compiled anew if damaged.
+"""On-disk cache of compiled loops: keyed by their sources, verified by digest, and recompiled if damaged.
 
-numba's own cache is a file with an index for each function, beside the source or in numba's folder: an empty or a cut
-off file there (a power failure) is an exception at every later start, two processes that compile at once can exchange
-each other's entries, a function is not compiled anew when one that it calls changes, and without a folder to write to
-nothing runs. Here an entry is one file, written whole or not at all, and its name is a digest of all that it was
-compiled from. An entry that cannot be read is none.
+numba's own cache has four problems. An empty or truncated index file (after a power failure) raises an exception at
+every later start. Two processes that compile at once can mix up their entries. A function is not recompiled when a
+function that it calls changes. Without a writable folder, nothing runs. Here, each entry is one file that is written
+atomically, and its name contains a digest of everything that it was compiled from. Unreadable entries are ignored.
 
-Entries are pickles, so a folder that somebody else could write to is not read either.
+Entries are pickles, so folders that other users can write to are not read.
 """
 
 from __future__ import annotations
@@ -32,28 +31,28 @@ from steadypose import PACKAGE
 logger = logging.getLogger(__name__)
 
 LOOPS = 150
-"""entries that the nodes take with the settings that ship"""
+"""Number of entries that the nodes need with the default settings."""
 COMPLETE = "complete"
-"""beside the entries: the digest of the sources that all of them are there for"""
+"""Name of a file beside the entries: the digest of the sources for which all entries exist."""
 _OTHERS = 3
-"""folders of other versions and processors that are kept"""
+"""Number of folders of other versions and processors that are kept."""
 _UNFINISHED = ".unfinished-"
 _MUCH = 5 * LOOPS
-"""entries of sources and settings that are no more in use"""
+"""Number of unused entries above which they are removed."""
 _WARNED = "STEADYPOSE_UNCACHED"
-"""in the environment, where a process that started this one has said that nothing can be kept"""
+"""Environment variable that is set once a parent process has warned that nothing can be cached."""
 _DIGEST = hashlib.sha256().digest_size
 
 saved: set[str] = set()
-"""entries that this process has compiled and written"""
+"""Names of the entries that this process has compiled and written."""
 watchers: list[Callable[[str], None]] = []
-"""called with the name of each entry as it is loaded or compiled"""
+"""Functions that are called with the name of each entry when it is loaded or compiled."""
 
 
 def folders() -> list[Path]:
-    """Where entries may be, the first to be written to first: beside the package, or else in the user's cache folder.
+    """Return the folders of entries in order of preference: beside the package, then in the user's cache folder.
 
-    ``NUMBA_CACHE_DIR``, which numba itself obeys, replaces both.
+    ``NUMBA_CACHE_DIR``, which numba also uses, replaces both.
     """
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(chosen).absolute() / "steadypose" / _version()]
@@ -67,7 +66,7 @@ def folders() -> list[Path]:
 
 @cache
 def _version() -> str:
-    """Of all that makes one machine's entries useless for another: Python, numba, and what the processor can do."""
+    """Return a name for everything that entries depend on besides sources: Python, numba, and the processor."""
     about = [importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy")]
     about += [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_OPT")]
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
@@ -77,13 +76,13 @@ def _version() -> str:
 
 
 def readable() -> Iterator[Path]:
-    """The folders that are there, and that nobody else can write to."""
+    """Return the existing folders that no other user can write to."""
     return (folder for folder in folders() if folder.is_dir() and _is_safe(folder))
 
 
 @cache
 def writable() -> Path | None:
-    """The first folder that entries can be written to, made if it is missing; None: there is none."""
+    """Return the first folder to which entries can be written, created if missing; None if there is none."""
     for folder in folders():
         with suppress(OSError):
             folder.mkdir(mode=0o755, parents=True, exist_ok=True)
@@ -100,7 +99,7 @@ def _is_safe(folder: Path) -> bool:
 
 
 def is_complete() -> bool:
-    """Whether all loops of the nodes have been compiled from these sources, on this machine."""
+    """Whether all loops of the nodes have been compiled from these sources on this machine."""
     for folder in readable():
         with suppress(OSError):
             if (folder / COMPLETE).read_text(encoding="ascii") == _sources():
@@ -109,7 +108,7 @@ def is_complete() -> bool:
 
 
 def mark_complete(folder: Path, entries: set[str]) -> None:
-    """Note that all is compiled; remove what is not of these ``entries`` where it has become much, and old versions."""
+    """Note that everything is compiled. Remove old versions, and entries other than these if there are many."""
     others = [file for file in folder.iterdir() if file.name not in (*entries, COMPLETE)]
     for file in others if len(others) > _MUCH else ():
         with suppress(OSError):
@@ -131,7 +130,7 @@ def _sources() -> str:
 
 
 def remove_damaged() -> int:
-    """Remove entries that are not as they were written, and with them the mark that all are there; returns how many."""
+    """Remove damaged entries, and the mark that all entries exist; returns the number of damaged entries."""
     damaged = 0
     for folder in readable():
         for file in folder.iterdir():
@@ -144,13 +143,13 @@ def remove_damaged() -> int:
 
 
 def _content(file: Path) -> bytes | None:
-    """What was written there; None: that is no longer what it holds."""
+    """Return the content of an entry; None if it is damaged."""
     data = file.read_bytes()
     return data[_DIGEST:] if hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST] else None
 
 
 def load(name: str, key: object) -> Any | None:
-    """What was saved under this name, if it is whole, and of this key."""
+    """Return the entry saved under this name, if it is undamaged and has this key."""
     for folder in readable():
         try:
             content = _content(folder / name)
@@ -160,7 +159,7 @@ def load(name: str, key: object) -> Any | None:
             found, entry = pickle.loads(content)
         except FileNotFoundError:
             continue
-        except Exception as error:  # whatever unpickling raises; it is only a cache
+        except Exception as error:  # unpickling raises many kinds, and a cache entry is not essential
             logger.warning("steadypose: %s cannot be used (%s); compiling it anew", folder / name, error)
             continue
         if found == key:
@@ -170,7 +169,7 @@ def load(name: str, key: object) -> Any | None:
 
 
 def save(name: str, data: bytes) -> None:
-    """Write an entry, whole or not at all. A full disk is no reason to stop: it is compiled the next time as well."""
+    """Write an entry atomically. If the disk is full, the loop is compiled again next time."""
     folder = writable()
     if folder is None:
         warn_uncached(logger.warning)
@@ -183,8 +182,8 @@ def save(name: str, data: bytes) -> None:
 
 @cache
 def announce() -> None:
-    """Say, once in a process, that it compiles: nobody should wonder what takes so long."""
-    if not watchers:  # who says more
+    """Log once per process that it compiles, to explain the delay."""
+    if not watchers:  # watchers report progress themselves
         logger.warning("steadypose: compiling loops for this processor, once")
 
 
@@ -206,7 +205,7 @@ def _write(file: Path, data: bytes) -> None:
 
 
 def warn_uncached(say: Callable[[str], None]) -> None:
-    """Say that nothing can be kept: once, for this process and those that it starts."""
+    """Warn that nothing can be cached, once for this process and its child processes."""
     if _WARNED in os.environ:
         return
     os.environ[_WARNED] = "1"
@@ -219,10 +218,10 @@ def warn_uncached(say: Callable[[str], None]) -> None:
 
 @cache
 def digest(loop: Any) -> str:
-    """Of all that a loop is compiled from: its code, and the constants and loops of its module that it names.
+    """Return a digest of everything that a loop is compiled from: its code, and the constants and loops that it names.
 
     Args:
-        loop: a dispatcher of numba.
+        loop: a numba dispatcher.
     """
     function, found = loop.py_func, hashlib.sha256()
     for part in _parts(function, loop):
@@ -251,7 +250,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _text(value: object) -> str:
-    """A value as text that is the same in every process."""
+    """Convert a value to text that is the same in every process."""
     if isinstance(value, (ModuleType, FunctionType, type)):
         return f"{value.__name__} {getattr(value, '_fields', '')}"
     if hasattr(value, "tobytes"):  # an array

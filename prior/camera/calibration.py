@@ -1,8 +1,8 @@
-"""Calibration of a camera: its lens from pictures of a ChArUco board, its place in the world from the floor.
+"""Camera calibration: intrinsics from images of a ChArUco board, extrinsics from the board or a view of the floor.
 
-The camera's frame is the optical one: x right, y down, z forward. The world is z up with the floor at z = 0. On a
-board that lies flat the world begins at the lower left corner of the pattern, as one reads it: x along the lower edge,
-y along the left one.
+The camera's frame is the optical frame: x right, y down, z forward. The world is z up with the floor at z = 0. If a
+board lies flat, the world's origin is the lower left corner of the pattern as one reads it, with x along the lower edge
+and y along the left edge.
 
 Lens: Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, as in OpenCV. Plane: RANSAC
 (Fischler and Bolles, CACM 24(6), 1981), then least squares over its inliers.
@@ -27,32 +27,31 @@ from steadypose.prior.camera.gravity import level_pose
 Image = NDArray[np.uint8]
 
 MIN_CORNERS, MIN_VIEWS = 6, 8
-"""Least number of the board's corners in a picture that is used, and of such pictures."""
+"""Least number of the board's corners in an image, and least number of such images."""
 
 MIN_TILT = np.radians(20.0)
-"""Least angle between the board's planes in two of the pictures, for parallel ones do not determine the focal length,
-radians."""
+"""Least angle between the board's planes in two images, radians; parallel planes do not determine the focal length."""
 
 MAX_FOCAL_SIGMA = 0.01
 """Largest relative standard deviation of a focal length that is accepted."""
 
 OUTLIER_RATIO = 3.0
-"""Ratio of a picture's error to the median of all beyond which it is left out: the board was bent, or moved."""
+"""Ratio of an image's error to the median above which it is rejected, because the board was bent or moved."""
 
 CORNER_SIGMA_PX, CORNER_SCALE_PX, CORNER_QUANTILE = 0.05, 0.3, 0.8
-"""Standard deviation of a corner well seen, and scale of the robust loss, pixels; quantile of the corners' reprojection
-errors by which a pose is accepted."""
+"""Standard deviation of a clearly visible corner, and scale of the robust loss, pixels; quantile of the corners'
+reprojection errors that decides whether a pose is accepted."""
 
 MAX_RMS_PX = 2.0
 """Largest root mean square reprojection error of a result that is accepted, pixels."""
 
 FLOOR_SLACK, FLOOR_SHARE, FLOOR_TILT = 0.02, 0.1, np.radians(10.0)
-"""Distance from the floor within which a point is an inlier, metres; least share of such points; largest angle of the
-floor's normal from where up is taken to be, radians."""
+"""Largest distance of an inlier from the floor, metres; least share of inliers; largest angle between the floor's
+normal and the assumed up direction, radians."""
 
 
 class CalibrationError(ValueError):
-    """The input does not determine the calibration. The text says what was expected, what was found, and what to do."""
+    """The input does not determine the calibration; the message says what was expected, found, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class Board:
     """A ChArUco board: a chessboard with markers in its white squares.
 
     Attributes:
-        columns, rows: squares.
-        square: metres, a square's side, as measured on the print.
-        marker: share of a square's side that a marker has.
+        columns, rows: numbers of squares.
+        square: metres, side of a square, measured on the print.
+        marker: side of a marker as a share of a square's side.
     """
 
     columns: int = 7
@@ -79,17 +78,17 @@ class Board:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Metres, width and height of the pattern."""
+        """Width and height of the pattern, metres."""
         return self.columns * self.square, self.rows * self.square
 
     @cached_property
     def pattern(self) -> cv2.aruco.CharucoBoard:
-        """The board as an OpenCV object; 4x4 markers, as these are recognised from farthest."""
+        """The board as an OpenCV object, with 4x4 markers, which are recognised from the largest distance."""
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker * self.square, dictionary)
 
     def picture(self, pixels_per_square: int) -> Image:
-        """(rows * pixels, columns * pixels) the pattern to print, without margin."""
+        """Return the pattern for printing, (rows * pixels, columns * pixels), without a margin."""
         return np.asarray(
             self.pattern.generateImage((self.columns * pixels_per_square, self.rows * pixels_per_square)), np.uint8
         )
@@ -97,7 +96,7 @@ class Board:
 
 @dataclass(frozen=True)
 class Corners:
-    """Where a picture shows the board's corners.
+    """The board's corners in an image.
 
     Attributes:
         board: (N, 3) metres, in the world of a board that lies flat.
@@ -113,7 +112,7 @@ class Intrinsics:
     """Intrinsics of a camera, in OpenCV's convention.
 
     Attributes:
-        size: pixels, width and height of the pictures.
+        size: pixels, width and height of the images.
         focal: (fx, fy) pixels.
         centre: (cx, cy) pixels.
         distortion: k1, k2, p1, p2, k3 of the Brown-Conrady model; empty for none.
@@ -138,10 +137,10 @@ class Intrinsics:
 
 
 def find_corners(picture: Image, board: Board) -> Corners | None:
-    """The board's corners in a picture (H, W) or (H, W, 3); None where too few are seen to be of use."""
+    """Detect the board's corners in an image (H, W) or (H, W, 3); None if too few are visible."""
     detector = cv2.aruco.CharucoDetector(board.pattern)
     points, image = np.zeros((0, 3)), np.zeros((0, 2))
-    for finer in (1, 2):  # small markers are read better when they are enlarged, large corners are found better as is
+    for finer in (1, 2):  # enlarging helps to read small markers; large corners are detected better without it
         enlarged = cv2.resize(picture, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
         corners, ids, _, _ = detector.detectBoard(enlarged)
         if ids is not None and len(ids) > len(points):
@@ -153,21 +152,21 @@ def find_corners(picture: Image, board: Board) -> Corners | None:
     if len(points) < MIN_CORNERS:
         return None
     if len(np.unique(points[:, 0])) < 2 or len(np.unique(points[:, 1])) < 2:
-        return None  # on one line: they say nothing of the board's plane
+        return None  # collinear corners do not determine the board's plane
     # OpenCV counts from the upper left corner, y down and z into the board
     flat = np.array([0.0, board.size[1], 0.0]) + points * [1.0, -1.0, -1.0]
     return Corners(flat, image)
 
 
 def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsics:
-    """The lens that took pictures of one board in many positions.
+    """Estimate the intrinsics from images of one board in many positions.
 
     Args:
-        views: of pictures of the same size.
-        size: pixels, width and height.
+        views: corners in images of the same size.
+        size: pixels, width and height of the images.
 
     Raises:
-        CalibrationError: too few pictures, they do not agree, or they are too much alike.
+        CalibrationError: there are too few images, they do not agree, or they are too similar.
     """
     kept = [view for view in views if len(view.image) >= MIN_CORNERS]
     while True:
@@ -217,9 +216,9 @@ class Placement:
     """Extrinsics of a camera.
 
     Attributes:
-        pose: of its optical frame in the world.
-        error_px: the 80th percentile of the corners' reprojection error.
-        sigma_m, sigma_rad: standard deviations of position and orientation, along the worst axis.
+        pose: pose of its optical frame in the world.
+        error_px: 80th percentile of the corners' reprojection error, pixels.
+        sigma_m, sigma_rad: standard deviations of position and orientation along the worst axis.
     """
 
     pose: Pose
@@ -229,16 +228,16 @@ class Placement:
 
 
 def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
-    """Extrinsics of a camera from pictures of a board that lies flat on the floor; neither moves.
+    """Estimate the extrinsics from images of a board that lies flat on the floor. Neither camera nor board may move.
 
     Raises:
-        CalibrationError: no picture, or the corners do not fit one place.
+        CalibrationError: there is no image, or the corners do not fit one pose of the board.
     """
     if not views:
         raise CalibrationError("expected a picture that shows the board on the floor, got none with enough corners")
     points = np.concatenate([view.board for view in views])
     image = np.concatenate([view.image for view in views])
-    # a plane seen from afar has two poses that look nearly alike: the better one, among those above the floor
+    # a distant plane has two poses that look almost the same: take the better one of those above the floor
     _, turns, moves, _ = cv2.solvePnPGeneric(points, image, lens.matrix, lens.coefficients, flags=cv2.SOLVEPNP_IPPE)
     starts = [np.asarray([*turn, *move], np.float64).ravel() for turn, move in zip(turns, moves, strict=True)]
     placed = [_refined(points, image, lens, start) for start in starts]
@@ -257,9 +256,9 @@ def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
 
 
 def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> Placement:
-    """The best pose near a first one, (6,) rotation vector and translation.
+    """Refine an initial pose (6,), rotation vector and translation.
 
-    Errors count with Cauchy's loss: a corner found wrong, as where glare or a crease lies over it, moves nothing.
+    Errors have the Cauchy loss, so a corner detected wrongly (under glare or a crease) has no influence.
     """
 
     def away(pose: Floats) -> Floats:
@@ -270,7 +269,7 @@ def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> 
     turn, move = fit.x[:3], fit.x[3:]
     error = float(np.quantile(np.linalg.norm(away(fit.x).reshape(-1, 2), axis=1), CORNER_QUANTILE))
     to_world = Rotation.from_rotvec(turn).inv()
-    # By the Gauss-Markov theorem; the camera's place is -R^T t, so both errors move it.
+    # by the Gauss-Markov theorem; the camera's position is -R^T t, so both errors affect it
     covariance = max(error, CORNER_SIGMA_PX) ** 2 * np.linalg.inv(fit.jac.T @ fit.jac)
     place = np.empty((3, 6))
     for k in range(3):
@@ -288,10 +287,10 @@ def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> 
 
 
 def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
-    """(N, 3) metres, optical frame: what a depth image (H, W) in millimetres sees; 0 is nothing.
+    """Convert a depth image (H, W) in millimetres, 0 where invalid, to points (N, 3) metres, optical frame.
 
     Raises:
-        CalibrationError: the image is not of the lens's size.
+        CalibrationError: the image does not have the size of the intrinsics.
     """
     height, width = depth.shape
     if (width, height) != lens.size:
@@ -307,20 +306,20 @@ def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
 
 
 def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
-    """Extrinsics of a camera that sees the floor: above the world's origin, looking along +y.
+    """Estimate the extrinsics of a camera that sees the floor. It is above the world's origin and looks along +y.
 
-    The floor is the lowest of the large planes that are about level.
+    The floor is the lowest of the large, approximately level planes.
 
     Args:
         points: (N, 3) metres, optical frame.
-        up: (3,) where up is, as gravity says, to `FLOOR_TILT`.
-        seed: of the sampling.
+        up: (3,) up direction from gravity, within `FLOOR_TILT`.
+        seed: random seed of the sampling.
 
     Returns:
-        the pose, and the share of points that lie on the floor.
+        The pose, and the share of points on the floor.
 
     Raises:
-        CalibrationError: no floor is seen.
+        CalibrationError: no floor is visible.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     points = points[np.isfinite(points).all(axis=1)]
@@ -339,7 +338,7 @@ def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
             continue
         height = float(normal @ a)
         count = int((np.abs(sample @ normal - height) < FLOOR_SLACK).sum())
-        # a table is a plane too: what lies under a plane was seen, so that plane is not the floor
+        # a table is a plane too: if points lie below a plane, it is not the floor
         under = int((sample @ normal < height - 3 * FLOOR_SLACK).sum())
         if under < 0.3 * count and (best is None or count > best[0]):
             best = count, normal, height

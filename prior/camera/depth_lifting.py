@@ -1,17 +1,17 @@
-"""Key points of a colour image, lifted to 3D by a depth image that is aligned to it.
+"""Lifts key points of a colour image to 3D with an aligned depth image.
 
-Depth from stereo is wrong where it matters: at the edge of a limb a pixel shows the wall behind, or something between
-the two. And a depth camera sees skin, a skeleton has joint centres. So the depth of a joint is
+Stereo depth is wrong at the edge of a limb, where a pixel shows the wall behind or a mixture of the two. A depth camera
+also measures the skin, not joint centres. The depth of a joint is therefore
 
 1. that of the nearest surface in a small neighbourhood on which enough pixels agree,
-2. within the reach of the bone that leads to it, from the trunk outwards, so that neither the wall nor what passes in
-   front of the body takes a joint,
+2. within the reach of the bone that leads to it, from the trunk outwards, so that neither the wall nor an object in
+   front of the body captures a joint,
 3. moved along the ray from the skin to the joint's centre.
 
-The root is anchored at the middle of the hips, where the trunk fills the neighbourhood. How far the hips lie behind
-the skin depends on how far the trunk is turned, and a trunk seen from the side hides one hip: that one's place then
-follows from the width of the hips, and from which arm and leg are nearer. Any other joint of which the depth is absent,
-at odds with the body, or another joint's is unobserved: NaN.
+The root is anchored at the midpoint of the hips, where the trunk fills the neighbourhood. The distance of the hips
+behind the skin depends on the trunk's turn. A trunk seen from the side hides one hip; the position of this hip follows
+from the width of the hips, and from which arm and leg are nearer. Any other joint is unobserved (NaN) if its depth is
+missing, contradicts the body, or belongs to another joint.
 
 Key points are those of COCO-17 (`prior.body.layouts.COCO17`).
 """
@@ -32,7 +32,7 @@ from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.compiled import njit
 
 MIN_CONFIDENCE = 0.3
-"""Least confidence of a key point that is used; below it, detectors guess."""
+"""Least confidence of a key point; below it, detectors guess."""
 
 _K = {name: index for index, name in enumerate(COCO17.joints)}
 _JOINTS = len(COCO17.joints)
@@ -41,28 +41,28 @@ _HIPS = (_K["left_hip"], _K["right_hip"])
 _TRUNK = (*_SHOULDERS, *_HIPS)
 _HEAD = tuple(_K[name] for name in ("nose", "left_eye", "right_eye", "left_ear", "right_ear"))
 
-# Metres from the skin that a camera sees to the joint's centre: half the limb's thickness. Nose and eyes lie on the
+# Distance from the visible skin to the joint's centre, metres: half the limb's thickness. Nose and eyes lie on the
 # skin, ears beside the middle of the head.
 _THICKNESS = {"ear": 0.05, "shoulder": 0.07, "elbow": 0.045, "wrist": 0.04, "hip": 0.12, "knee": 0.065, "ankle": 0.055}
 _TO_CENTRE = np.array([_THICKNESS.get(name.split("_")[-1], 0.0) for name in COCO17.joints])
 
 _HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
-"""Half axes of the trunk at the hips, cut level: an ellipse, metres."""
+"""Half axes of the trunk's horizontal cross-section at the hips, an ellipse, metres."""
 _HIP_WIDTH, _SHOULDER_WIDTH, _TRUNK_LENGTH, _TRUNK_LENGTHS = 0.35, 0.70, 0.51, (0.42, 0.60)
-"""Widths of hips and shoulders, joint to joint, in lengths of the trunk (middle of the shoulders to middle of the
-hips); the trunk's usual length and the range that is accepted, metres."""
+"""Widths of hips and shoulders, joint to joint, in lengths of the trunk (midpoint of the shoulders to midpoint of the
+hips); the trunk's usual length and the accepted range, metres."""
 _MAX_TURN_COSINE, _HIP_SLACK, _SEEN_WIDTH = np.cos(np.radians(50)), 0.03, 0.65
-"""Cosine of the turn beyond which the far hip is hidden; deviation of a hip's depth from the width of the hips, metres;
-share of the shoulders' width below which one of them is hidden."""
+"""Cosine of the turn above which the far hip is hidden; tolerance of a hip's depth, given the width of the hips,
+metres; share of the shoulders' width below which one shoulder is hidden."""
 _TURN_EVIDENCE, _FAR_SIDE_THRESHOLD, _CONFIDENCE_EVIDENCE = 0.10, 0.5, 0.05
-"""Difference in depth of both sides' arms and legs from which on the nearer side is certain, metres; share of that from
-which on the far side is taken as known; and the same difference in a detector's confidence."""
+"""Difference in depth of both sides' arms and legs above which the nearer side is certain, metres; share of it above
+which the far side counts as known; and the equivalent difference in a detector's confidence."""
 _FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
-"""Least distance of the far elbow, wrist, knee and ankle behind the middle of the hips, metres."""
+"""Least distance of the far elbow, wrist, knee and ankle behind the midpoint of the hips, metres."""
 _TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
-"""Longest distance from the trunk's depth to a shoulder or hip, and from middle shoulder to face, metres."""
+"""Largest distances from the trunk's depth to a shoulder or hip, and from between the shoulders to the face, metres."""
 _ARM, _LEG = (0.45, 0.40), (0.60, 0.60)
-"""Longest bones that are accepted, metres."""
+"""Largest accepted lengths of the bones of arm and leg, metres."""
 _LIMBS = [
     ([_K[f"{side}_{joint}"] for joint in joints], lengths)
     for side in ("left", "right")
@@ -70,20 +70,20 @@ _LIMBS = [
 ]
 _LIMB_ENDS = [[_K[f"{side}_{joint}"] for joint in ("elbow", "wrist", "knee", "ankle")] for side in ("left", "right")]
 _MIN_SEPARATION = {"ear": 0.08, "elbow": 0.06, "wrist": 0.06, "knee": 0.06, "ankle": 0.05}
-"""Distance of a left and a right joint below which they are one that was seen twice, metres."""
+"""Distance of a left and a right joint below which they are one joint detected twice, metres."""
 
 _RADIUS, _MIN_PIXELS, _MAX_PIXELS = 0.03, 2.0, 16.0
-"""Radius of the disc about a key point that is sampled, metres at the body, and its range in the image, pixels."""
+"""Radius of the sampled disc about a key point, metres at the body, and its range in the image, pixels."""
 _GRID = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)), axis=-1).reshape(-1, 2)
 _DISC = _GRID[np.hypot(*_GRID.T) <= 1.0]
 _LINE_SAMPLES = np.linspace(0.1, 0.9, 9)
-"""Shares of a line between joints at which it is sampled."""
+"""Positions of the samples on a line between joints, as shares of the line."""
 _BAND, _BAND_GROWTH, _MIN_FILL = 0.04, 0.005, 0.25
-"""Extent in depth of one surface, metres, and its growth with the distance's square, 1/m, as the noise of stereo; least
-share of its neighbourhood that it fills."""
+"""Depth range of one surface, metres, and its growth with the squared distance, 1/m, like stereo noise; least share of
+the neighbourhood that a surface fills."""
 _HIP_SAMPLES, _HIP_SIDE_SAMPLES, _TRUNK_BAND = 2.7, 2.2, 0.25
-"""Ratios of the discs about the middle of the hips and each of them to that radius; extent in depth of a trunk's skin,
-leaning or turned, metres."""
+"""Radii of the discs about the midpoint of the hips and about each hip, relative to `_RADIUS`; depth range of a leaning
+or turned trunk's skin, metres."""
 
 
 def lift(
@@ -95,14 +95,14 @@ def lift(
         keypoints: (B, 17, 2) pixels of the depth image, x right and y down; NaN where missing.
         confidence: (B, 17) 0 to 1.
         depth: (H, W) along the optical axis: metres if floating, millimetres if integer (REP 118); 0 or NaN is a hole.
-        intrinsics: (3, 3) of the image, which has no distortion.
+        intrinsics: (3, 3) camera matrix of the image, which has no distortion.
 
     Returns:
-        positions (B, 17, 3) metres in the optical frame (x right, y down, z forward), NaN where unobserved, and
+        Positions (B, 17, 3) metres in the optical frame (x right, y down, z forward), NaN where unobserved, and
         confidence (B, 17), 0 where unobserved.
 
     Raises:
-        ValueError: shapes that do not fit together.
+        ValueError: the shapes do not match.
     """
     keypoints, confidence = np.asarray(keypoints, np.float64), np.asarray(confidence, np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (_JOINTS, 2) or confidence.shape != keypoints.shape[:2]:
@@ -197,7 +197,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
     if hips:
         positions[list(_HIPS)] = hips.places(turn)
         if hips.turned and abs(turn) > _FAR_SIDE_THRESHOLD:
-            # what is not behind the middle of the trunk is the trunk, or the other limb, that hides this one
+            # a surface that is not behind the middle of the trunk is the trunk or the other limb, which hides this one
             far = _LIMB_ENDS[0 if turn > 0 else 1]
             hidden = positions[far, 2] < hips.middle[2] + _FAR_LIMBS
             positions[np.array(far)[hidden]] = np.nan
@@ -207,7 +207,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
 
 @dataclass(frozen=True)
 class _Hips:
-    """The root: the middle of the hips, from which both follow."""
+    """The root: the midpoint of the hips, which determines both hips."""
 
     middle: Floats
     """(3,) metres"""
@@ -225,7 +225,7 @@ class _Hips:
         """From key points (17, 2), the middle of the shoulders (3,) and the depth of the trunk."""
         both = pixels[list(_HIPS)]
         centre = both.mean(axis=0)
-        # wider than an arm that hangs before the hips: where there are two surfaces, the trunk is the one behind
+        # the disc is wider than an arm in front of the hips: of two surfaces, the trunk is the one behind
         samples = view.sample(centre + _HIP_SAMPLES * radius * _DISC)
         skin = -_surface(-samples, -trunk - _TRUNK_REACH, -trunk + _TRUNK_REACH)
         if not np.isfinite(skin):
@@ -299,7 +299,7 @@ def _nearest_surface(samples: Floats, low: float, high: float, least: float) -> 
         while last < len(depths) and depths[last] <= depths[first] + band:
             last += 1
         if last - first >= least and until == np.inf:
-            # pixels that mix two depths lie in front of a surface: its place is where most agree
+            # pixels that mix two depths lie in front of a surface; its depth is where most pixels agree
             until = depths[first] + band
         if until < np.inf and last - first > best_count:
             best, best_count = first, last - first
@@ -322,9 +322,9 @@ def _behind(ray: Floats, skin: float, to_centre: float) -> Floats:
 
 
 def _turn(positions: Floats, confidence: Floats) -> float:
-    """Which side of a body seen from the side is farther: 1 the left, -1 the right, 0 unknown, between if unsure.
+    """Return the farther side of a body seen from the side: 1 left, -1 right, 0 unknown, between if uncertain.
 
-    By the depth of its arms and legs; where these hide each other, by the confidence of the detector.
+    The depths of arms and legs decide. If these hide each other, the detector's confidences decide.
     """
     left, right = positions[_LIMB_ENDS[0]], positions[_LIMB_ENDS[1]]
     distinct = np.linalg.norm(left - right, axis=-1) > max(_MIN_SEPARATION.values())
@@ -337,7 +337,7 @@ def _turn(positions: Floats, confidence: Floats) -> float:
 
 
 def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_width: float) -> None:
-    """Of a left and a right joint at one place, the hidden one goes: that of the far side, or the less sure one."""
+    """Of coincident left and right joints, remove the hidden one: that of the far side, or the less confident one."""
     apart = _MIN_SEPARATION | {"shoulder": _SEEN_WIDTH * shoulder_width}
     for name, least in apart.items():
         left, right = _K[f"left_{name}"], _K[f"right_{name}"]
@@ -347,7 +347,7 @@ def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_w
 
 
 def _mean(positions: Floats, joints: Sequence[int]) -> Floats:
-    """(3,) middle of those of the joints that are known; NaN if none is."""
+    """(3,) mean of the known joints among these; NaN if none is known."""
     chosen = positions[list(joints)]
     known = np.isfinite(chosen).all(axis=-1)
     return chosen[known].mean(axis=0) if known.any() else np.full(3, np.nan)

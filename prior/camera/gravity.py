@@ -1,7 +1,7 @@
-"""The pose of a camera's frame from its accelerometer: which way is up.
+"""Estimates the orientation of a camera's frame from its accelerometer.
 
 Gravity gives two of the three angles. The third, the heading, is not observable: a levelled camera looks along the
-world's +y, as `msgs.types.Pose.from_up` has it.
+world's +y, as in `msgs.types.Pose.from_up`.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
 
 GRAVITY = 9.81
-"""m/s²"""
+"""Acceleration of gravity, m/s²."""
 MAX_DEVIATION = 0.7
-"""m/s²: a reading further from gravity is of a camera that is being moved"""
+"""Largest difference of a reading from gravity, m/s²; beyond it, the camera is being moved."""
 MEMORY_S = 1.0
-"""time constant of the exponential average of readings"""
+"""Time constant of the exponential average of readings, seconds."""
 UPDATE_ANGLE = np.radians(1.0)
-"""the pose is updated when the direction has changed by so much, so that the world does not shake with the noise"""
+"""Least change of direction that updates the pose, radians, so that the world does not shake with the noise."""
 
 
 def level_pose(up: Floats) -> Pose:
-    """The pose, at the origin, of an optical frame in which ``up`` (3,) points up; its z axis looks along +y.
+    """Return the pose, at the origin, of an optical frame in which ``up`` (3,) points up; its z axis is along +y.
 
     Raises:
         ValueError: ``up`` is no direction.
@@ -33,7 +33,7 @@ def level_pose(up: Floats) -> Pose:
     if up.shape != (3,) or not np.isfinite(length) or length == 0:
         raise ValueError(f"up: expected a direction of shape (3,), got {up!r}")
     up = up / length
-    # a camera that looks straight up or down has its image's top or bottom ahead
+    # for a camera that looks straight up or down, the top or bottom of its image points ahead
     forward = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
     forward = forward - (forward @ up) * up
     forward /= np.linalg.norm(forward)
@@ -41,12 +41,12 @@ def level_pose(up: Floats) -> Pose:
 
 
 class GravityEstimator:
-    """The direction of gravity from an accelerometer's readings; that of a level camera until there are any.
+    """Estimates the direction of gravity from an accelerometer; assumes a level camera before the first reading.
 
     Attributes:
-        pose: of the camera's frame in the world.
-        up: (3,) what points up in the camera's frame.
-        measured: whether both rest on readings.
+        pose: pose of the camera's frame in the world.
+        up: (3,) up direction in the camera's frame.
+        measured: whether both are based on readings.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class GravityEstimator:
         self._last_ns = 0
 
     def update(self, acceleration: Floats, stamp_ns: int) -> None:
-        """Take a reading: acceleration (3,) m/s² in the camera's frame, gravity included (9.81 up at rest)."""
+        """Process a reading: acceleration (3,) m/s² in the camera's frame, including gravity (9.81 up at rest)."""
         strength = np.linalg.norm(acceleration)
         if not abs(strength - GRAVITY) < MAX_DEVIATION:
             return

@@ -1,4 +1,4 @@
-"""Key points of one person in one camera's image, with what it measures in depth."""
+"""Key points of one person in one camera's image, with the camera's depth measurements."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Floats
 
 NEAREST, FARTHEST = 0.05, 100.0
-"""Range of distances of a point from the camera, in metres."""
+"""Range of distances of a point from the camera, metres."""
 
 
 @dataclass(frozen=True)
@@ -18,14 +18,14 @@ class KeyPointRecording:
     """One person's key points at the times of a 30 Hz grid, in canonical joints.
 
     Attributes:
-        stamps_ns: (T,) of the grid.
-        pixels: (T, 22, 2); NaN where not found.
-        confidence: (T, 22).
-        focal: (2,) pixels.
-        centre: (2,) pixels.
-        rotation: (3, 3) from the camera's frame to one that is z up.
-        camera_height: metres; None where not known.
-        points: (T, N, 3) metres, in the camera's frame; None where there are none.
+        stamps_ns: (T,) stamps of the grid, nanoseconds.
+        pixels: (T, 22, 2); NaN where not detected.
+        confidence: (T, 22) in 0..1.
+        focal: (2,) focal lengths, pixels.
+        centre: (2,) principal point, pixels.
+        rotation: (3, 3) rotation from the camera's frame to a z-up frame.
+        camera_height: metres above the floor; None if unknown.
+        points: (T, N, 3) metres, points of the body's surface in the camera's frame; None if there are none.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -39,7 +39,9 @@ class KeyPointRecording:
 
 
 def in_sight(points: Floats) -> Floats:
-    """Points (T, N, 3) metres from a depth camera, NaN where none can see them: at its place, where many put what they
-    have no depth of, or too far away."""
+    """Set impossible points (T, N, 3) metres of a depth camera to NaN.
+
+    These are points too far away, and points at the camera, where many cameras put pixels without depth.
+    """
     away = np.linalg.norm(np.where(np.isfinite(points), points, np.inf), axis=-1, keepdims=True)
     return np.where((away > NEAREST) & (away < FARTHEST), points, np.nan)

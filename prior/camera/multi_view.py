@@ -1,9 +1,8 @@
-"""Several calibrated cameras as one: their bodies at one moment, matched by place and merged joint by joint.
+"""Fuses several calibrated cameras: matches their bodies by position, and merges them joint by joint.
 
-Cameras do not take their images at the same moments: each one's bodies are first interpolated to a common grid. Their
-observations of a joint are then weighted by confidence, by distance, and by direction, for a depth camera errs more
-along its line of sight than across; the weights are inverse covariances, and the mean is that of independent
-measurements.
+Cameras do not take images at the same time, so each camera's bodies are first interpolated to a common grid. The
+observations of a joint are then averaged as independent measurements, with inverse covariances as weights. These depend
+on confidence, distance and direction, because a depth camera's error is larger along the line of sight than across it.
 """
 
 from __future__ import annotations
@@ -24,23 +23,21 @@ from steadypose.prior.timing.rate import FPS
 PERIOD_NS = round(1e9 / FPS)
 SOURCE, FRAME_ID = "merged", "world"
 MATCH_RADIUS_M = 0.4
-"""Largest distance of two cameras' observations of one body, the median over the joints, metres."""
+"""Largest distance between two cameras' observations of one body, median over the joints, metres."""
 CONFLICT_M = 0.25
-"""Distance of two observations of a joint beyond which they contradict each other, metres: the one of less variance is
-taken."""
+"""Distance between two observations of a joint above which only the one with less variance is used, metres."""
 DEPTH_ERROR_RATIO = 2.0
-"""Ratio of the error along the line of sight to that across it."""
+"""Ratio of the error along the line of sight to the error across it."""
 MAX_WAIT_NS = 100_000_000
-"""Time for which a camera is waited for before the others are merged without it, nanoseconds."""
+"""Longest time to wait for a camera before the others are merged without it, nanoseconds."""
 CAMERA_TIMEOUT_NS = 500_000_000
-"""Time without an image after which a camera is not waited for, nanoseconds."""
+"""Time without an image after which a camera is no longer awaited, nanoseconds."""
 MAX_GAP_NS = 150_000_000
 """Longest gap between images of a camera that is interpolated, nanoseconds."""
 CLOCK_RESET_FRAMES = 30
-"""Number of consecutive images of all cameras that come too late after which the merged stream starts anew: the clocks
-were set."""
+"""Number of consecutive late images of all cameras after which the merged stream starts anew (clocks were set)."""
 MAX_BODIES = 16
-"""Largest number of bodies of a message that are merged; a camera observes fewer."""
+"""Largest number of a message's bodies that are merged; cameras observe fewer."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class CameraFrame:
     """The bodies in one frame of one camera.
 
     Attributes:
-        stamp_ns: capture.
+        stamp_ns: time of capture, nanoseconds.
         joints: (N, 22, 3) metres, world; NaN where unobserved.
         confidence: (N, 22), 0 where unobserved.
         eye: (3,) metres, world: where the camera stands.
@@ -63,11 +60,11 @@ class CameraFrame:
 class Merge:
     """Merges the ``pose/raw`` of several cameras into one, on a 30 Hz grid of capture times.
 
-    A frame is published when every camera that is there has sent its image, or `MAX_WAIT_NS` later. Only stamps
-    count, so the cameras' clocks must agree (on several machines by NTP or PTP); what comes too late is counted.
+    A frame is published when every active camera has sent its image, or after `MAX_WAIT_NS`. Only stamps count, so the
+    cameras' clocks must be synchronised (across machines by NTP or PTP). Late images are counted.
 
     Attributes:
-        counters: what was refused or came too late, by cause and camera.
+        counters: numbers of refused and late messages, by cause and camera.
     """
 
     def __init__(self) -> None:
@@ -81,7 +78,7 @@ class Merge:
         self._late = 0
 
     def update(self, raw: PoseRaw) -> list[PoseRaw]:
-        """Take a camera's message; returns the merged messages that it completes, oldest first."""
+        """Process a camera's message and return the merged messages that it completes, oldest first."""
         frame = self._frame(raw)
         if frame is None:
             return []
@@ -102,7 +99,7 @@ class Merge:
         return self._complete()
 
     def _frame(self, raw: PoseRaw) -> CameraFrame | None:
-        """A message's bodies in the world; None if it cannot be used."""
+        """Return a message's bodies in the world; None if it cannot be used."""
         skeleton, place = SKELETONS.get(raw.skeleton), raw.sensor_pose
         unit = abs(float(np.linalg.norm(place.orientation)) - 1.0) < 0.01
         if raw.end_of_stream:
@@ -153,11 +150,11 @@ class CameraBody:
 
 
 def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:
-    """The bodies of several cameras at one moment, one list of observations for each body."""
+    """Match the bodies of several cameras at one time; returns a list of observations for each body."""
     groups: list[list[CameraBody]] = []
     for view in sorted(views, key=lambda view: -len(view.joints)):
         own = [CameraBody(j, c, view.eye) for j, c in zip(view.joints, view.confidence, strict=True)]
-        # a body is where the first camera that has it observes it
+        # a body's position is that of the first camera that observes it
         firsts = np.array([group[0].joints for group in groups]).reshape(-1, 22, 3)
         pairs = {body: group for group, body in match_bodies(firsts, view.joints)}
         for body, observed in enumerate(own):
@@ -169,7 +166,7 @@ def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:
 
 
 def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
-    """Pairs of bodies (N, 22, 3) and (M, 22, 3) that are in one place: the assignment with the least distances."""
+    """Return pairs of bodies (N, 22, 3) and (M, 22, 3) at the same position, by the assignment of least distance."""
     away = np.linalg.norm(some[:, None] - others[None], axis=-1)
     both = np.isfinite(away).any(axis=-1)
     distance = np.full(away.shape[:2], np.inf)
@@ -180,10 +177,11 @@ def match_bodies(some: Floats, others: Floats) -> list[tuple[int, int]]:
 
 
 def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
-    """Joints (22, 3) and their confidence (22,) of a body that several cameras observe.
+    """Merge several cameras' observations of a body to joints (22, 3) and their confidence (22,).
 
-    The precision of an observation, up to a factor, is ``c² / d² (I + (1 / ALONG² - 1) r rᵀ)`` for confidence c,
-    distance d and line of sight r; the confidence that all were wrong is the product.
+    The precision of an observation, up to a factor, is ``c² / d² (I + (1 / q² - 1) r rᵀ)`` for confidence c,
+    distance d, line of sight r and q = `DEPTH_ERROR_RATIO`. The probability that all observations are wrong is the
+    product of theirs.
     """
     joints = np.array([observed.joints for observed in bodies])
     confidence = np.array([observed.confidence for observed in bodies])
@@ -207,12 +205,12 @@ def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
 
 
 def _ticks(after_ns: int, until_ns: int) -> range:
-    """The grid's moments after one stamp, up to another."""
+    """Return the grid times after one stamp, up to another."""
     return range((after_ns // PERIOD_NS + 1) * PERIOD_NS, until_ns + 1, PERIOD_NS)
 
 
 def _interpolated(before: CameraFrame | None, after: CameraFrame, tick: int) -> CameraFrame:
-    """A camera's observations at a moment between two images; those of the later one where there is no earlier."""
+    """Interpolate a camera's observations between two images; without an earlier one, use the later one."""
     joints, confidence = after.joints.copy(), after.confidence.copy()
     if before:
         share = (tick - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)

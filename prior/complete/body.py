@@ -1,8 +1,8 @@
-"""Completion of a recording: motion between key frames, and unobserved parts of a body.
+"""Completion of a recording: motion between key frames (in-betweening), and unobserved parts of a body.
 
-Known joints stay unchanged, to the last bit. The rest comes from the completer, window by window (`views`; each gap is
-inside one with both its ends, and windows overlap), on the person's bones. Known joints are a few millimetres off these
-bones, which are not quite constant: the residual is interpolated from one known frame to the next.
+Known joints do not change, bit for bit. The completer estimates the rest with the person's bones, window by window
+(`views`). Windows overlap, and each gap lies in one window with both its ends. Measured bone lengths vary, so known
+joints are a few millimetres off these bones. This residual is interpolated between known frames.
 """
 
 from __future__ import annotations
@@ -20,51 +20,51 @@ from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.models.completer_features import draw_line, rotations_of_6d
 
 MIN_SIGMA = 0.002
-"""Metres along an axis: the least of a joint that was given."""
+"""Least standard deviation of a given joint along an axis, metres."""
 
 MIN_NEVER = 0.015
-"""The same of a joint that was never given."""
+"""Least standard deviation along an axis of a joint that was never given, metres."""
 
 DRIFT, MAX_DRIFT, LONG = 0.0045, 0.14, 60.0
-"""Drift of a body in a gap without the pelvis: metres along an axis a frame from the gap's nearer end, its maximum, and
-the frames of a gap from which on it is in full; in shorter ones it is in proportion. By validation people, where root
-mean squares reach 135 mm."""
+"""Drift of a body in a gap without the pelvis: metres along an axis per frame from the gap's nearer end, maximum in
+metres, and length of gaps with the full drift in frames. In shorter gaps, drift is proportional to their length. Values
+are from validation people, whose RMS drift reaches 135 mm."""
 
 LONGEST_GAP = 64
-"""Frames of the longest gap that the completer was trained on."""
+"""Longest gap on which the completer is trained, frames."""
 
 AROUND = 7
-"""Frames of context that a window has on each side of a gap, where the recording has them."""
+"""Context of a window on each side of a gap, if the recording has it, frames."""
 
 LONGEST = LONGEST_GAP + 2 * AROUND
-"""Frames of a window."""
+"""Longest window, frames."""
 
 _HOP = 32
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of the completer's output, as found on validation people.
+    """Uncertainty of the completer's output, measured on validation people.
 
     Attributes:
-        never: (22,) metres along an axis, standard deviation of each joint that is known in no frame.
-        half: frames from the nearest in which a joint is known at which it is half of that.
+        never: (22,) metres along an axis, standard deviation of each joint if it is known in no frame.
+        half: frames from a joint's nearest known frame at which its standard deviation is half of that.
     """
 
     never: Sequence[float]
     half: float
 
     def of(self, given: Floats) -> Floats:
-        """(T, 22) metres along an axis, of joints (T, 22, 3) metres, NaN where not given.
+        """(T, 22) metres along an axis, standard deviations of joints (T, 22, 3) metres, NaN where not given.
 
-        The noise of joints that were given is estimated from their second differences.
+        The noise of given joints is estimated from their second differences.
         """
         known = finite_joints(given)
         apart = frames_apart(known)
         bends = np.linalg.norm(np.diff(given, n=2, axis=0), axis=-1)
         noise = np.full(22, MIN_SIGMA)
         for joint in np.flatnonzero(np.isfinite(bends).any(axis=0)):
-            # the median of a normal vector's length, of which a second difference has six times the variance
+            # 1.538 is the median length of a standard normal vector; a second difference has six times the variance
             noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), MIN_SIGMA)
         grown = 1.0 - self.half / (apart + self.half)
         guessed = np.hypot(np.maximum(self.never, MIN_NEVER) * grown, noise)
@@ -76,12 +76,12 @@ class Uncertainty:
 
 
 def frames_apart(known: NDArray[np.bool_]) -> Floats:
-    """(T, K) frames to the nearest one in which each is ``known`` (T, K); infinite where there is none."""
+    """(T, K) frames to the nearest frame in which each column is ``known`` (T, K); infinite if there is none."""
     return np.minimum(*frames_since_and_until(known))
 
 
 def frames_since_and_until(known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """(T, K) frames since the last and until the next one in which each is ``known`` (T, K); infinite where none."""
+    """(T, K) frames since the last and until the next frame in which each column is ``known``; infinite if none."""
     at = np.arange(len(known), dtype=np.float64)[:, None]
     before = np.maximum.accumulate(np.where(known, at, -np.inf), axis=0)
     after = np.minimum.accumulate(np.where(known, at, np.inf)[::-1], axis=0)[::-1]
@@ -89,11 +89,11 @@ def frames_since_and_until(known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
 
 
 Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
-"""A completer of whole windows, such as `LiveCompleter`: positions (B, T, 22, 3), NaN where not known, and bones
-(B, 22, 3) to local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3); metres."""
+"""Type of a completer of whole windows, such as `LiveCompleter`. It maps positions (B, T, 22, 3), NaN where unknown,
+and bones (B, 22, 3) to local rotations (B, T, 22, 3, 3) and root positions (B, T, 3), metres."""
 
 BENT = 0.02
-"""Metres that a known joint is off its bones from which on the unknown joints above it are solved again to reach it."""
+"""Distance of a known joint from its bones above which the unknown joints above are solved again, metres."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ class Completed:
     """A body's completed motion.
 
     Attributes:
-        positions: (T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all that is known.
+        positions: (T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all known frames.
         rotations: (T, 22, 3, 3) local; NaN likewise.
         known: (T, 22) which joints were given.
-        span: frames of the longest gap that was filled.
+        span: length of the longest gap that was filled, frames.
     """
 
     positions: Floats
@@ -120,9 +120,9 @@ def complete(
 
     Args:
         fill: a completer.
-        positions: (T, 22, 3) metres, z up, at 30 Hz; NaN where not known.
+        positions: (T, 22, 3) metres, z up, at 30 Hz; NaN where unknown.
         offsets: (22, 3) metres, the person's bones.
-        advanced: called with the end of each window that is done.
+        advanced: called with the end of each finished window.
 
     Raises:
         ValueError: no joint is known in any frame.
@@ -142,7 +142,7 @@ def complete(
 def _completed(
     fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
-    """Joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near a known one."""
+    """Return joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near known frames."""
     known = finite_joints(positions)
     bridged = _bridged(fill, positions, offsets)
     rotations, root = _filled(fill, bridged, offsets, advanced)
@@ -158,7 +158,7 @@ def _completed(
 
 
 def _faded(missed: Floats, known: Bools) -> Floats:
-    """Residuals (T, 22, 3) of known joints interpolated in time for all; a joint never known has its parent's."""
+    """Interpolate the known joints' residuals (T, 22, 3) in time; a joint that is never known gets its parent's."""
     line = draw_line(known[None])
     before, after = (np.take_along_axis(missed, rows[..., None], axis=0) for rows in (line.before[0], line.after[0]))
     weight = line.weight[0][..., None]
@@ -170,9 +170,9 @@ def _faded(missed: Floats, known: Bools) -> Floats:
 
 
 def _bridged(fill: Fill, positions: Floats, offsets: Floats) -> Floats:
-    """Positions (T, 22, 3) with key frames put into gaps longer than `LONGEST_GAP`, so that those left are shorter.
+    """Insert key frames into gaps longer than `LONGEST_GAP`, so that the remaining gaps are shorter.
 
-    The key frames come from the completer on every n-th frame of the gap and of what is around it.
+    The key frames come from the completer, applied to every n-th frame of the gap and its surroundings.
     """
     bridged, frames = positions.copy(), len(positions)
     for gap in gaps(finite_joints(positions)):
@@ -192,9 +192,9 @@ def _bridged(fill: Fill, positions: Floats, offsets: Floats) -> Floats:
 
 
 def _filled(fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None]) -> tuple[Floats, Floats]:
-    """Rotations (T, 22, 3, 3) and root (T, 3) of all frames.
+    """Return rotations (T, 22, 3, 3) and root (T, 3) of all frames.
 
-    Where windows overlap, the weighted means of their rotations' first two columns and of their roots are taken.
+    Where windows overlap, the first two columns of their rotations and their roots are averaged by weight.
     """
     known = finite_joints(positions)
     frames = len(positions)
@@ -218,7 +218,7 @@ class View(NamedTuple):
 
     Attributes:
         start: its first frame.
-        weight: (frames,) of its output, beside those of the windows that overlap it.
+        weight: (frames,) weight of its output where windows overlap.
     """
 
     start: int
@@ -230,23 +230,23 @@ class View(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Frames ``start`` to ``end - 1``, of which nothing is known."""
+    """Frames ``start`` to ``end - 1``, in which no joint is known."""
 
     start: int
     end: int
 
 
 def gaps(known: Bools) -> list[Gap]:
-    """Runs of frames in which no joint is ``known`` (T, 22)."""
+    """Return the runs of frames in which no joint is ``known`` (T, 22)."""
     blank = np.concatenate([[False], ~known.any(axis=1), [False]]).astype(np.int8)
     return [Gap(*ends) for ends in zip(*(np.flatnonzero(np.diff(blank) == d) for d in (1, -1)), strict=True)]
 
 
 def views(known: Bools) -> list[View]:
-    """Windows over all frames with a joint that is not ``known`` (T, 22); no gap may be longer than `LONGEST_GAP`.
+    """Return windows over all frames with unknown joints (T, 22). No gap may be longer than `LONGEST_GAP`.
 
-    Gaps, with what lies between them where that is short, have windows of their own, for both ends have to be inside.
-    The other frames have windows that overlap by half.
+    A gap, or several gaps close together, gets its own window, because both ends must lie inside. The other frames get
+    windows that overlap by half.
     """
     frames = len(known)
     own = np.zeros(frames)
@@ -264,7 +264,7 @@ def views(known: Bools) -> list[View]:
             weight[:rise] = (np.arange(rise) + 1.0) / (rise + 1.0)
         if fall:
             weight[-fall:] = (np.arange(fall, 0, -1)) / (fall + 1.0)
-        # within a gap that the next windows or the last ones see but one end of, this one alone is asked
+        # a gap of which this window sees only one end is left to the window that contains both
         for gap in gaps(known[first:last]):
             if not any(gap.start + first == whole.start and gap.end + first == whole.end for whole in waiting[:taken]):
                 weight[gap.start : gap.end] = 0.0

@@ -1,7 +1,7 @@
-"""The completer blended with HG-VAE's completion where parts of a body are hidden: that was trained longer on these,
-but not on gaps in time.
+"""Blends the completer with HG-VAE's completion where parts of a body are hidden.
 
-Where some joints of a frame are known and others not, the result lies between the two; rotations are solved anew.
+HG-VAE's completion is trained longer on hidden parts, but not on gaps in time. In frames with known and unknown joints,
+the result is a blend of both, and rotations are solved again.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.weights import WeightsError, load_weights, part
 
 SHARE = 0.8
-"""Of HG-VAE's completion in the blend, by validation (benchmarks/NOTEBOOK.md)."""
+"""Share of HG-VAE's completion in the blend (chosen on validation, benchmarks/NOTEBOOK.md)."""
 
 SMOOTH = 3.0
-"""Frames, standard deviation of the Gaussian that smooths the difference of the two: HG-VAE's completion gives hidden
-limbs ten times the acceleration of true ones."""
+"""Standard deviation of the Gaussian that smooths the difference of the two, frames. Hidden limbs in HG-VAE's
+completion have ten times the acceleration of real ones."""
 
 
 class PartsCompleter:
-    """Completes windows as `LiveCompleter` does.
+    """Completes windows, with the interface of `LiveCompleter`.
 
     Args:
-        completer: of gaps and parts.
+        completer: the completer of gaps and parts.
         weights: weight set of HG-VAE.
 
     Raises:
         FileNotFoundError: there are no such weights.
-        WeightsError: they have no completion network.
+        WeightsError: the weights have no completion network.
     """
 
     def __init__(self, completer: LiveCompleter, weights: str = "default") -> None:
@@ -51,21 +51,21 @@ class PartsCompleter:
 
     @property
     def usual(self) -> Floats:
-        """(22, 4) quaternions, xyzw, local, of the mean pose."""
+        """(22, 4) local quaternions, xyzw, of the mean pose."""
         return self._completer.usual
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """As `LiveCompleter`: local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres."""
+        """Return local rotations (B, T, 22, 3, 3) and root positions (B, T, 3), metres, like `LiveCompleter`."""
         rotations, root = self._completer(positions, offsets)
         for row, (given, bones) in enumerate(zip(positions, offsets, strict=True)):
             known = finite_joints(given)
             partly = np.asarray(known.any(axis=1) & ~known.all(axis=1))
             if not partly.any() or not known[partly, 0].all():
-                continue  # nothing but gaps; or no root to look at the body from
+                continue  # only gaps, or no root that could be the body's origin
             first = place_joints(rotations[row], bones) + root[row][:, None]
             second = self._second(given, first, bones)
             joints = first + SHARE * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
-            # in a gap, joints that are known beside it are the completer's alone
+            # within a gap, joints that are known in other frames come from the completer alone
             asked = ~known & (partly[:, None] | ~known.any(axis=0))
             some = asked.any(axis=1)
             joints = np.where(known[..., None], given, np.where(asked[..., None], joints, first))[some]
@@ -76,7 +76,7 @@ class PartsCompleter:
     def _second(self, given: Floats, first: Floats, bones: Floats) -> Floats:
         """(T, 22, 3) HG-VAE's completion of a window ``given`` (T, 22, 3) metres, NaN where hidden.
 
-        In frames of which nothing is known, the joints known in other frames are given as in ``first`` (T, 22, 3).
+        In frames without known joints, joints that are known in other frames are taken from ``first`` (T, 22, 3).
         """
         known = finite_joints(given)
         blank = ~known.any(axis=1)
@@ -89,7 +89,7 @@ class PartsCompleter:
         )
         total, weight = np.zeros_like(given), np.zeros((frames, 1, 1))
         for start in starts:
-            rows = np.minimum(np.arange(start, start + self._frames), frames - 1)  # a short one stands still at its end
+            rows = np.minimum(np.arange(start, start + self._frames), frames - 1)  # short windows repeat the last frame
             tracks = to_tracks(shown[rows], size)
             deviations = ((tracks.x - self._mean) / SCALE)[None]
             hang_unseen(deviations)

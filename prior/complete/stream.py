@@ -1,8 +1,8 @@
-"""The bodies of a recording on the grid of 30 Hz, to be completed, and what was completed as ``pose/clean``.
+"""Completes the bodies of a recording on the 30 Hz grid, and returns the result as ``pose/clean``.
 
-A key frame may stand seconds from the next: so, other than `clean`, this gives frames where the input has none. The
-trajectory of a body whose joints are known relative to its root only is the root's velocity, read from the body's
-motion and integrated (HM-VAE, section 3.3 and Figure 5).
+Key frames may be seconds apart, so unlike `clean`, this outputs frames where the input has none. If joints are known
+only relative to the root, the trajectory is the integral of the root velocity that is predicted from the body's motion
+(HM-VAE, section 3.3 and Figure 5).
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import PERIOD_NS
 
 APART_NS = 8_000_000_000
-"""Gap in nanoseconds, without any observation of a body, that is not filled if longer: a new stretch begins."""
+"""Longest gap without any observation of a body that is filled, nanoseconds; a longer one starts a new stretch."""
 
 BETWEEN_NS = PERIOD_NS * 3 // 2
-"""Interval in nanoseconds up to which two observations of a joint are joined by a line; in longer ones motion is
-completed."""
+"""Longest interval between two observations of a joint that is interpolated linearly, nanoseconds. Motion in longer
+intervals is completed."""
 
 SIZES = (0.4, 2.5)
-"""Range of factors between a person's bones and those of a generic adult; others are not in metres."""
+"""Range of ratios of a person's bones to a generic adult's; outside it, positions are not in metres."""
 
 STILL_M, MOVING_M = 1e-3, 0.03
-"""Metres: extent of a root below which it is the origin of its coordinates, if another joint's is above the second."""
+"""Largest extent of a root's motion, and least extent of another joint's, of root-relative coordinates, metres."""
 
 _FEET = slice(2, 6)
 _EDGES = ((np.max, 1.0), (np.min, -1.0))
 
 
 class CompletionError(ValueError):
-    """A recording cannot be completed. The text says what was expected, what came, and what to do."""
+    """A recording cannot be completed; the message says what was expected, what was found, and what to do."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A body on the grid, from when it was first observed until it was away for long.
+    """A body on the grid, from its first observation until it was unobserved for long.
 
     Attributes:
-        body: its number.
-        first: of its frames, counted on the grid.
-        given: (T, 22, 3) metres, z up; NaN where not known.
+        body: its id.
+        first: index on the grid of its first frame.
+        given: (T, 22, 3) metres, z up; NaN where unknown.
         offsets: (22, 3) metres, its bones.
     """
 
@@ -72,13 +72,13 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Completion:
-    """What came of a recording.
+    """The completion of a recording.
 
     Attributes:
         anchor_ns: stamp of the grid's first frame.
-        done: every stretch, and what it was completed to.
+        done: every stretch with its completion.
         clean: ``pose/clean`` of the frames with a body, and the end of the stream.
-        centred: numbers of bodies whose pelvis lies at the origin, whose trajectory is read from their motion.
+        centred: ids of bodies whose pelvis is at the origin, so that their trajectory is predicted from their motion.
     """
 
     anchor_ns: int
@@ -88,13 +88,13 @@ class Completion:
 
     @property
     def given(self) -> float:
-        """Share of the joints that the recording knew."""
+        """Share of the joints that the recording contained."""
         known = [completed.known.mean() for _, completed in self.done]
         return float(np.average(known, weights=[len(stretch.given) for stretch, _ in self.done]))
 
     @property
     def unreached(self) -> int:
-        """Number of joints too far from all that is known."""
+        """Number of joints too far in time from all known joints."""
         return sum(int((~finite_joints(completed.positions)).sum()) for _, completed in self.done)
 
 
@@ -109,15 +109,15 @@ def complete_raws(
     """Complete the bodies of a recording.
 
     Args:
-        source: what errors call the recording.
-        raws: its messages, one at least.
+        source: name of the recording in error messages.
+        raws: its messages, at least one.
         fill: a completer.
         uncertainty: standard deviations of its output.
         began: called with the number of frames of all bodies together.
-        advanced: called with how many of them are done.
+        advanced: called with the number of finished frames.
 
     Raises:
-        CompletionError: it has an unknown skeleton, nobody, or nobody in metres.
+        CompletionError: the recording has an unknown skeleton, no body, or no body in metres.
     """
     anchor_ns = min(message.stamp_ns for message in raws)
     stretches = _stretches(source, raws, anchor_ns)
@@ -134,7 +134,7 @@ def complete_raws(
 
 
 def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Stretch]:
-    """Every body of a recording on the grid that begins at ``anchor_ns``."""
+    """Return every body of a recording on the grid that begins at ``anchor_ns``."""
     stamps: dict[int, list[int]] = defaultdict(list)
     positions: dict[int, list[Floats]] = defaultdict(list)
     for message in raws:
@@ -163,7 +163,7 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
 
 
 def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns: int) -> list[Stretch]:
-    """A body on the grid, in as many parts as it was away for long between."""
+    """Resample a body to the grid, divided into parts at long gaps."""
     offsets = estimate_offsets(positions[:: max(len(positions) // 900, 1)])
     _check_size(body, offsets)
     ends = np.flatnonzero(np.diff(stamps) > APART_NS) + 1
@@ -181,7 +181,7 @@ def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns:
 
 
 def interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
-    """(N, 3) at ``ticks`` (N,); NaN where no observation is near."""
+    """(N, 3) positions interpolated at ``ticks`` (N,); NaN where no observation is near."""
     after = np.searchsorted(stamps, ticks).clip(0, len(stamps) - 1)
     before = np.where(stamps[after] > ticks, np.maximum(after - 1, 0), after)
     span = stamps[after] - stamps[before]
@@ -205,7 +205,7 @@ def _check_size(body: int, offsets: Floats) -> None:
 def _clean_messages(
     raws: Sequence[PoseRaw], done: list[tuple[Stretch, Completed]], uncertainty: Uncertainty, anchor_ns: int
 ) -> list[PoseClean]:
-    """``pose/clean`` of every frame of the grid on which there is a body, in the frames in which these were seen."""
+    """Build ``pose/clean`` of every grid frame with a body, in the frames of the input."""
     bodies: dict[int, list[CleanBody]] = defaultdict(list)
     ordered = sorted(raws, key=lambda message: message.stamp_ns)
     stamps = np.array([message.stamp_ns for message in ordered])
@@ -254,11 +254,11 @@ def _clean_messages(
 
 
 def root_steps(completion: Completion, weights: str) -> dict[tuple[int, int], Floats]:
-    """How far to move bodies that are known about their root only: (3,) metres by number and frame of the grid.
+    """Return displacements (3,) metres, by id and grid frame, of bodies that are known only relative to their root.
 
     Args:
-        completion: of a recording.
-        weights: of the network that predicts a root's velocity.
+        completion: the completion of a recording.
+        weights: weight set of the root velocity network.
     """
     steps: dict[tuple[int, int], Floats] = {}
     if not completion.centred:
@@ -273,7 +273,7 @@ def root_steps(completion: Completion, weights: str) -> dict[tuple[int, int], Fl
 
 
 def moved(message: PoseClean, steps: Mapping[tuple[int, int], Floats], anchor_ns: int) -> PoseClean:
-    """The message with bodies where their `root_steps` have them."""
+    """Return the message with its bodies moved by `root_steps`."""
     frame = round((message.stamp_ns - anchor_ns) / PERIOD_NS)
     turn = rotation_matrix(message.sensor_pose.orientation)
     bodies = [
@@ -286,7 +286,7 @@ def moved(message: PoseClean, steps: Mapping[tuple[int, int], Floats], anchor_ns
 
 
 def is_root_centred(positions: Floats) -> bool:
-    """Whether joints (T, 22, 3) metres, NaN where unknown, are about their pelvis: it stays while others move."""
+    """Whether joints (T, 22, 3) metres, NaN where unknown, are relative to the pelvis: it stays while others move."""
     known = finite_joints(positions)
     if known[:, 0].sum() < FPS // 3:
         return False
@@ -297,12 +297,12 @@ def is_root_centred(positions: Floats) -> bool:
 
 
 def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """(T, 3) m/s, world: velocities of the root.
+    """Predict root velocities (T, 3) m/s, world.
 
     Args:
-        network: run on one frame after the other.
-        joints: (T, 22, 3) metres from the root, z up.
-        root_rotations: (T, 3, 3) to the world.
+        network: the network, run frame by frame.
+        joints: (T, 22, 3) metres relative to the root, z up.
+        root_rotations: (T, 3, 3) rotations of the root to the world.
     """
     yaw = heading(root_rotations)
     features = velocity_features(joints, np.concatenate([joints[:1], joints[:-1]]), FRAME_S, yaw)
@@ -314,9 +314,10 @@ def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats
 
 
 def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """(T, 3) metres, world: the root's path from above the origin, with the lower foot always on the floor.
+    """Return the root's path (T, 3) metres, world, which starts above the origin; the lower foot is always on the
+    floor.
 
-    The arguments are those of `velocities`.
+    Arguments are as in `velocities`.
     """
     path = np.cumsum(velocities(network, joints, root_rotations), axis=0) * FRAME_S
     path -= path[0]
@@ -326,12 +327,13 @@ def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats)
 
 
 def bridge(network: LiveRootVelocity, joints: Floats, root_rotations: Floats, ends: Floats) -> Floats:
-    """(K, 3) metres, world: the root's path over the last K frames between two known ends; the closing error of the
-    integrated velocities is spread evenly over the frames.
+    """Return the root's path (K, 3) metres, world, over the last K frames between two known ends.
+
+    The closing error of the integrated velocities is distributed evenly over the frames.
 
     Args:
-        network, joints, root_rotations: of `velocities`, of T frames.
-        ends: (K, 3) metres, world, of the last K of the T frames; the first row and the last are known.
+        network, joints, root_rotations: as in `velocities`, for T frames.
+        ends: (K, 3) metres, world, positions in the last K of the T frames; only the first and last row are used.
     """
     steps = velocities(network, joints, root_rotations)[-len(ends) :] * FRAME_S
     way = np.cumsum(steps, axis=0)

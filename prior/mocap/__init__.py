@@ -1,1 +1,1 @@
-"""Files of motion capture as canonical joints, metres, z up: BVH of any rig, AMC, TRC, C3D, AMASS."""
+"""Reads motion capture files as canonical joints, metres, z up: BVH with any rig, AMC, TRC, C3D, AMASS."""

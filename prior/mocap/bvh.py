@@ -1,9 +1,9 @@
 """Biovision Hierarchy (.bvh) files.
 
-Written here rather than taken from a package: `docs/results.md`, "Importers", has what was weighed. The format
-leaves open what a position channel means. By the original definition it is added to the joint's OFFSET; exporters
-that give every joint position channels write the whole offset into them, and there it replaces the OFFSET. Here
-it is added at a root, where the two differ by a constant shift of the world only, and replaces it elsewhere.
+This is our own reader; `docs/results.md`, "Importers", compares packages. The format does not define what a position
+channel means. In the original definition, it is added to the joint's OFFSET. Exporters that give every joint position
+channels write the whole offset into them, so there it replaces the OFFSET. Here it is added at a root, where the two
+differ only by a constant shift of the world, and replaces the OFFSET elsewhere.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from steadypose.prior.body.rigs import UNITS, Rig, collar, skeleton
 from steadypose.prior.mocap.clip import MotionError, documented, forward
 
-# CMU's motion in its commonest conversion (B. Hahne's, cgspeed.com, and what derives from it): topology alone does not
-# tell the skeleton, for the length of each bone with several children is lost, of the thorax (12 cm, as long as the
-# upper back in the ASF) and the wrist's part of the forearm (9 cm, half of the radius there).
+# CMU's motion in its most common conversion (B. Hahne's, cgspeed.com, and derivatives). Topology alone does not
+# determine this skeleton, because bones with several children have lost their lengths: the thorax (12 cm, as long as
+# the upper back in the ASF) and the wrist's part of the forearm (9 cm, half of the radius in the ASF).
 CMU_BVH = Rig(
     skeleton(
         "cmu_bvh",
@@ -66,12 +66,12 @@ class Bvh:
     """A BVH file.
 
     Attributes:
-        joints: names, parents first. The end site of joint ``A`` is ``A_end``, and ``A_end2`` if it has another.
+        joints: names, parents first. The end site of joint ``A`` is ``A_end``; a second one is ``A_end2``.
         parents: index of each joint's parent; -1 for a root.
         offsets: (J, 3) in the file's unit and axes.
-        channels: of each joint, in the file's order.
-        fps: frames a second.
-        values: (T, C) of all channels, degrees and the file's unit.
+        channels: channels of each joint, in the file's order.
+        fps: frames per second.
+        values: (T, C) values of all channels, degrees and the file's unit.
     """
 
     joints: tuple[str, ...]
@@ -83,10 +83,10 @@ class Bvh:
 
     @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:
-        """(T, J, 3) in the file's unit and axes, by forward kinematics.
+        """(T, J, 3) positions in the file's unit and axes, by forward kinematics.
 
         Args:
-            lost_bones: see `prior.body.rigs.Rig`; given back their length where the file has none.
+            lost_bones: see `prior.body.rigs.Rig`; these bones get their length back if the file has none.
         """
         offsets = self.offsets.copy()
         for name, multiple in (lost_bones or {}).items():
@@ -115,7 +115,7 @@ def read_bvh(text: str) -> Bvh:
     """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites.
 
     Raises:
-        MotionError: it is not one, or its motion does not fit its hierarchy.
+        MotionError: it is no BVH file, or its motion does not match its hierarchy.
     """
     head, found, motion = text.partition("MOTION")
     if not found:
@@ -174,7 +174,7 @@ def _hierarchy(tokens: list[str]) -> list[_Node]:
 
 
 def _motion(text: str, channels: int) -> tuple[NDArray[np.float64], float]:
-    """Values (T, channels), and frames a second."""
+    """Return values (T, channels), and frames per second."""
     words = text.split(maxsplit=5)
     if len(words) < 5 or words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
         raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")

@@ -1,4 +1,4 @@
-"""What every reader gives: one recording, its joints in metres, z up, and where it comes from."""
+"""The output of every reader: one recording, with joints in metres, z up, and its origin."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
 from steadypose.prior.npz import MotionError
 
 Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Turns a y-up frame into a z-up one by a quarter turn about x (both right-handed)."""
+"""Rotation from a y-up frame to a z-up frame: a quarter turn about x (both right-handed)."""
 
 TO_Z_UP: Mapping[str, NDArray[np.float64]] = {"z": np.eye(3), "y": Y_UP_TO_Z_UP, "-y": Y_UP_TO_Z_UP.T}
-"""By the axis that points up."""
+"""Rotations to a z-up frame, by the axis that points up."""
 
 
 P = ParamSpec("P")
@@ -25,7 +25,7 @@ R = TypeVar("R")
 
 
 def documented(read: Callable[P, R]) -> Callable[P, R]:
-    """A reader whose every error is a `MotionError`: of damaged files numpy, zipfile and scipy raise dozens."""
+    """Convert all errors of a reader to `MotionError`; on damaged files, numpy, zipfile and scipy raise dozens."""
 
     @wraps(read)
     def reader(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -44,13 +44,13 @@ class Clip:
     """One recording of one person.
 
     Attributes:
-        name: unique within its source.
+        name: name that is unique within its source.
         source: the data set.
-        licence: its licence, as an SPDX identifier where there is one.
-        subject: who moves, as far as the source tells.
-        action: what they do, as far as the source tells; else empty.
-        fps: frames a second.
-        skeleton: whose joints ``positions`` holds.
+        licence: its licence, as an SPDX identifier if there is one.
+        subject: the person, as named by the source.
+        action: what the person does, as named by the source; otherwise empty.
+        fps: frames per second.
+        skeleton: the skeleton of ``positions``.
         positions: (T, J, 3) metres, z up; NaN where missing.
     """
 
@@ -65,19 +65,19 @@ class Clip:
 
     @property
     def person(self) -> str:
-        """Who moves, by one name in all files of a source: see `person_of`."""
+        """The person's name, equal in all files of a source (see `person_of`)."""
         return person_of(self.source, self.subject)
 
     @property
     def seconds(self) -> float:
-        """Duration."""
+        """Duration, seconds."""
         return len(self.positions) / self.fps
 
     def canonical(self) -> Clip:
-        """The same recording with the canonical joints.
+        """Return the recording with canonical joints.
 
         Raises:
-            MotionError: the skeleton's table leaves a canonical joint out; training needs complete bodies.
+            MotionError: the skeleton's table lacks a canonical joint; training needs complete bodies.
         """
         if not self.skeleton.observable.all():
             raise MotionError(f"{self.name}: the table of '{self.skeleton.name}' does not give all 22 joints")
@@ -85,23 +85,22 @@ class Clip:
 
 
 def person_of(source: str, subject: str) -> str:
-    """A person's name among all sources: CMU's subject 02 is one person in whatever form the file comes."""
+    """Return a person's name that is unique among all sources. CMU's subject 02 is one person in every file format."""
     return f"{source.partition(' (')[0]} {subject}"
 
 
 def forward(
     parents: Sequence[int], offsets: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions of any skeleton from its local rotations.
+    """Compute positions of any skeleton from its local rotations.
 
     Args:
-        parents: of J joints, each before its children; -1 for a root.
-        offsets: (J, 3) or, with bones that move, (T, J, 3), each joint in its parent's frame; a root's is its
-            position.
+        parents: parents of J joints, each before its children; -1 for a root.
+        offsets: (J, 3) or, if bones vary, (T, J, 3), each joint in its parent's frame; a root's offset is its position.
         local: (T, J, 3, 3) rotations.
 
     Returns:
-        positions (T, J, 3) in the unit of ``offsets``, and global rotations (T, J, 3, 3).
+        Positions (T, J, 3) in the unit of ``offsets``, and global rotations (T, J, 3, 3).
     """
     offsets = np.broadcast_to(offsets, local.shape[:-1])
     positions, rotations = np.empty(local.shape[:-1]), np.empty(local.shape)

@@ -1,7 +1,7 @@
-"""One file of motion, of any kind that is read: its body as canonical joints, metres, z up.
+"""Reads one motion file of any supported format as canonical joints, metres, z up.
 
-BVH (`prior.mocap.bvh`), AMASS' .npz, and named points: TRC, the text that OpenSim and
-Pose2Sim write, and C3D, that of motion capture, through ezc3d. What a file does not say, its `Description` may.
+The formats are BVH (`prior.mocap.bvh`), AMASS' .npz, and named points: TRC, the text format of OpenSim and Pose2Sim,
+and C3D, the format of motion capture systems, through ezc3d. A `Description` adds what a file does not contain.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "mil
 
 @dataclass(frozen=True)
 class Description:
-    """What a file of motion does not say, or says wrongly; empty where it is to be trusted or recognised.
+    """Properties that a motion file lacks or states wrongly. Empty fields are read from the file or recognised.
 
     Attributes:
-        canonical: canonical joint -> the file's joint, or several, whose middle it is.
-        metres: the size of the file's unit; 0 where it is recognised.
-        up: the axis that points up, ``z``, ``y`` or ``-y``.
-        fps: frames a second; 0 as the file says.
-        skeleton: of arrays without names, whose joints they are.
+        canonical: canonical joint -> the file's joint, or several joints of which it is the mean.
+        metres: size of the file's unit, metres; 0 to recognise it.
+        up: the axis that points up: ``z``, ``y`` or ``-y``.
+        fps: frames per second; 0 for the file's value.
+        skeleton: skeleton of the joints in arrays without names.
     """
 
     canonical: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
@@ -51,17 +51,17 @@ UNDESCRIBED = Description()
 
 
 class Motion(NamedTuple):
-    """What a file holds: frames a second, and (T, 22, 3) metres, z up; NaN where missing."""
+    """The content of a file: frames per second, and positions (T, 22, 3) metres, z up; NaN where missing."""
 
     fps: float
     positions: Floats
 
 
 def describe(table: Mapping[str, Any]) -> Description:
-    """The description that a TOML file (``--rig``) gives.
+    """Build the description from a TOML file (``--rig``).
 
     Raises:
-        MotionError: it says something else, or of a joint that is none.
+        MotionError: it contains an unknown key, joint or value.
     """
     kinds = {"canonical": Mapping, "metres": (int, float), "up": str, "fps": (int, float), "skeleton": str}
     for key, value in table.items():
@@ -79,15 +79,15 @@ def describe(table: Mapping[str, Any]) -> Description:
 
 @documented
 def read_motion(name: str, content: bytes, description: Description = UNDESCRIBED) -> Motion:
-    """Read a file of motion by its suffix, one of `SUFFIXES`.
+    """Read a motion file in the format of its suffix, one of `SUFFIXES`.
 
     Args:
-        name: of the file, for errors and for its suffix.
+        name: name of the file, for its suffix and for error messages.
         content: its bytes.
-        description: what it does not say.
+        description: properties that the file lacks.
 
     Raises:
-        MotionError: it cannot be read, or holds no body.
+        MotionError: the file cannot be read, or contains no body.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in _READERS:
@@ -101,14 +101,14 @@ def read_motion(name: str, content: bytes, description: Description = UNDESCRIBE
 
 
 _Read = tuple[float, Skeleton, Floats, str]
-"""Frames a second, whose joints, (T, J, 3) metres, and the axis that points up, if it is known."""
+"""Type of a reader's result: frames per second, skeleton, positions (T, J, 3) metres, and the up axis if known."""
 
 
 def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, description: Description) -> Rig:
-    """The rig of a file: as described, as one of the tables has it, or recognised.
+    """Return the rig of a file: as described, from a table, or recognised.
 
     Raises:
-        RigError: a joint that is described is not there, or no body is recognised.
+        RigError: a described joint is missing, or no body is recognised.
     """
     if description.canonical:
         named = _described("described", joints, description.canonical)
@@ -136,14 +136,14 @@ def _bvh(content: bytes, description: Description) -> _Read:
 
 @documented
 def read_amass(file: IO[bytes]) -> tuple[float, Floats]:
-    """SMPL, SMPL-H or SMPL-X poses as AMASS stores them: ``poses``, ``trans`` and the frame rate.
+    """Read SMPL, SMPL-H or SMPL-X poses as stored by AMASS: ``poses``, ``trans`` and the frame rate.
 
-    No body model is used, so that its licence binds nobody: the rotations move the rest skeleton of
-    `prior.body.skeleton`, a generic adult, whatever the subject's shape. Joint angles are the recording's own, bone
-    lengths and the height of the root above the floor are not.
+    No body model is used, so its licence does not apply. The rotations are applied to the rest skeleton of
+    `prior.body.skeleton`, a generic adult, for any subject. Joint angles are those of the recording; bone lengths and
+    the height of the root above the floor are not.
 
     Returns:
-        frames a second, and (T, 22, 3) metres, canonical joints, z up.
+        Frames per second, and canonical joints (T, 22, 3) metres, z up.
 
     Raises:
         MotionError: an array is missing or has another shape.
@@ -158,7 +158,7 @@ def read_amass(file: IO[bytes]) -> tuple[float, Floats]:
         raise MotionError(f"expected poses (T, 66 or more) and trans (T, 3), got {poses.shape} and {trans.shape}")
     maps = poses[:, : 3 * len(PARENTS)].reshape(-1, 3)
     local = Rotation.from_rotvec(maps).as_matrix().reshape(len(poses), len(PARENTS), 3, 3)
-    # SMPL's rest pose faces +z with y up; ours faces +x with z up.
+    # SMPL's rest pose faces +z with y up; ours faces +x with z up
     steps = np.tile(REST_OFFSETS[:, [1, 2, 0]], (len(poses), 1, 1))
     steps[:, 0] = trans
     return fps, forward(PARENTS, steps, local)[0]
@@ -200,7 +200,7 @@ def _c3d(content: bytes, description: Description) -> _Read:
         import ezc3d
     except ImportError as error:
         raise MotionError("reading C3D needs ezc3d: install steadypose[mocap]") from error
-    with NamedTemporaryFile(suffix=".c3d") as file:  # it reads by name alone
+    with NamedTemporaryFile(suffix=".c3d") as file:  # ezc3d reads files only by name
         file.write(content)
         file.flush()
         point = (read := ezc3d.c3d(file.name))["parameters"]["POINT"]
@@ -211,7 +211,7 @@ def _c3d(content: bytes, description: Description) -> _Read:
 
 
 def _points(fps: float, names: Sequence[str], points: Floats, units: str, description: Description) -> _Read:
-    """Of named points: markers of the Plug-in-Gait set on the skin, or joints."""
+    """Read named points, which are skin markers of the Plug-in-Gait set or joints."""
     metres = description.metres or POINT_UNITS.get(units.strip().lower(), 0.001)
     if description.canonical:
         return fps, _described("described", names, description.canonical), points * metres, ""
@@ -227,4 +227,4 @@ _READERS: Mapping[str, Callable[[bytes, Description], _Read]] = {
 }  # fmt: skip
 
 SUFFIXES = tuple(_READERS)
-"""Of files of motion."""
+"""Suffixes of motion files."""

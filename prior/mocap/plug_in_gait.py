@@ -1,21 +1,21 @@
 """Joint centres from the skin markers of Vicon's Plug-in-Gait set.
 
-Markers lie on the skin, half a joint away from what a skeleton needs. The centres follow published methods:
+Markers lie on the skin, half a joint's width from the joint's centre. The centres follow published methods:
 
 - hips: regression on the pelvis' width and depth (Harrington et al. 2007, J. Biomech. 40:595, the simple
   equations, without the leg's length);
 - knees and elbows: the chord function of Davis et al. 1991 (Hum. Mov. Sci. 10:575) that Plug-in-Gait uses,
   half a joint's width inwards from the lateral marker. Plug-in-Gait takes the lateral direction from a wand
-  marker and is as wrong as that marker's placement (up to 50 degrees on these recordings), so it is turned
-  about the limb to agree with the axis about which the joint was seen to bend, once for each subject (after
-  Schwartz & Rozumalski 2005, J. Biomech. 38:107, who find the axes by function too);
+  marker, whose placement is wrong by up to 50 degrees in these recordings. Here, the direction is turned about
+  the limb to agree with the axis about which the joint bends, once for each subject (functional axes, after
+  Schwartz & Rozumalski 2005, J. Biomech. 38:107);
 - ankles: half a joint's width inwards from the malleolus, square to shank and foot;
 - shoulders: 17 % of the distance between the acromia below the acromion (Rab et al. 2002, Gait & Posture
   15:113);
 - wrists: half way between the wrist's two markers.
 
-Joints of the trunk and head are no anatomical points but the canonical skeleton's own, and are weighted means
-of markers about them.
+The joints of trunk and head are not anatomical points but defined by the canonical skeleton. They are weighted means of
+the markers around them.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ from numpy.typing import NDArray
 from steadypose.prior.body.skeleton import JOINTS
 
 MARKER_RADIUS = 0.007
-"""Metres from the skin to a marker's centre (14 mm markers)."""
+"""Distance from the skin to a marker's centre, metres (14 mm markers)."""
 
 KNEE_WIDTH, ANKLE_WIDTH, ELBOW_WIDTH = 0.105, 0.072, 0.072
-"""Metres across the joint, adult means: Plug-in-Gait wants them measured, the recordings lack them."""
+"""Widths of joints, adult means, metres. Plug-in-Gait expects measured widths, which the recordings lack."""
 
 TOE_DEPTH = 0.02
-"""Metres from the toe marker down to the forefoot's joint (marker radius and half the foot's thickness)."""
+"""Distance from the toe marker down to the forefoot's joint, metres (marker radius and half the foot's thickness)."""
 
 BAND_TO_EARS = 0.08
-"""Metres from the band with the head's markers down to the height of the ears."""
+"""Distance from the band with the head's markers down to the height of the ears, metres."""
 
 MAX_PELVIS_WIDTH, MAX_PELVIS_DEPTH = 0.30, 0.22
-"""Metres. Soft tissue carries the front markers of a heavy subject out and forward (46 by 27 cm on one of
-these subjects), where the regression, fitted to lean ones, would put the hips 32 cm apart."""
+"""Largest width and depth of the pelvis in the regression, metres. Soft tissue displaces the front markers of heavy
+subjects outwards and forwards (46 by 27 cm for one subject); the regression, fitted to lean subjects, would then place
+the hips 32 cm apart."""
 
 MIN_BEND = 0.3
-"""Sine of the bend below which a limb is too straight to show the axis it bends about."""
+"""Sine of the bend below which a limb is too straight to show its axis of bending."""
 
 MIN_BEND_WEIGHT = 20.0
-"""Sum of sin(bend) over frames that a subject's axis must rest on; with less, the wand stands."""
+"""Least sum of sin(bend) over frames for a subject's functional axis; with less, the wand's direction is used."""
 
 _SIDED = ("FHD", "BHD", "SHO", "UPA", "ELB", "WRA", "WRB", "ASI", "PSI", "THI", "KNE", "TIB", "ANK", "HEE", "TOE")
 MARKERS = ("C7", "T10", "CLAV", "STRN", *(side + name for side in "LR" for name in _SIDED))
-"""Of the set, those that joints rest on."""
+"""Markers of the set that joints are computed from."""
 
 Markers = Mapping[str, NDArray[np.float64]]
 Array = NDArray[np.float64]
@@ -78,13 +79,13 @@ _HINGES: Mapping[str, _Hinge] = {
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is measured once of a subject.
+    """Measurements of a subject.
 
     Attributes:
         pelvis_width: metres between the front markers of the pelvis.
-        pelvis_depth: metres from their mid-point to that of the back markers.
+        pelvis_depth: metres from their midpoint to the midpoint of the back markers.
         acromia: metres between the shoulder markers.
-        axis: for each knee and elbow, the angle (rad) about the upper limb from its wand to the axis of bending.
+        axis: for each knee and elbow, the angle about the upper limb from its wand to the axis of bending, radians.
     """
 
     pelvis_width: float
@@ -98,7 +99,7 @@ def _unit(v: Array) -> Array:
 
 
 def _reject(v: Array, along: Array) -> Array:
-    """Unit vector of the part of ``v`` square to the unit vector ``along``."""
+    """Unit vector of the component of ``v`` perpendicular to the unit vector ``along``."""
     return _unit(v - (v * along).sum(-1, keepdims=True) * along)
 
 
@@ -138,7 +139,7 @@ def _limb_axes(upper: Array, m: Markers, hinge: _Hinge) -> tuple[Array, Array, A
 
 
 def _chord(upper: Array, marker: Array, along: Array, lateral: Array, offset: float) -> Array:
-    """The joint: ``offset`` from its marker, away from ``lateral``, seeing marker and upper joint at 90 degrees."""
+    """Joint at ``offset`` from its marker, away from ``lateral``, that sees marker and upper joint at 90 degrees."""
     cos = offset / np.linalg.norm(upper - marker, axis=-1, keepdims=True)
     return marker + offset * (cos * along - np.sqrt(1 - cos**2) * lateral)
 
@@ -188,20 +189,20 @@ def calibrate(recordings: Iterable[Markers]) -> Calibration:
 
 
 def _bend_axis(joint: str, upper: Array, m: Markers) -> float:
-    """Angle (rad) from the wand to the axis of bending, such that limb and axis are square, on the mean of frames.
+    """Angle from the wand to the axis of bending, radians: the mean over frames, with the axis normal to the bent limb.
 
-    The joint's centre, and with it the plane of the limb, depends on the axis: a few rounds settle it.
+    The joint's centre and the limb's plane depend on the axis, so the estimate is iterated a few times.
     """
     hinge = _HINGES[joint]
     _, wand, third = _limb_axes(upper, m, hinge)
     angle = 0.0
     for _ in range(4):
         place = _hinge_joint(upper, m, hinge, angle)
-        # As long as the sine of the bend, so that the mean trusts a frame as far as it shows the axis.
+        # its length is the sine of the bend, so the mean weights frames by how well they show the axis
         normal = np.cross(_unit(upper - place), _unit(_below(joint, place, m) - place))
         x, y = (normal * wand).sum(-1), (normal * third).sum(-1)
         bent = np.hypot(x, y) > MIN_BEND
-        # Of the normal's two directions, the one on the wand's side.
+        # of the normal's two directions, take the one on the wand's side
         sign = np.where(x < 0, -1.0, 1.0)[bent]
         x, y = (x[bent] * sign).sum(), (y[bent] * sign).sum()
         if np.hypot(x, y) < MIN_BEND_WEIGHT:
@@ -218,7 +219,7 @@ def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
         calibration: of the same subject.
 
     Returns:
-        (T, 22, 3) metres in the frame of the markers; NaN where a marker that a joint rests on is lost.
+        (T, 22, 3) metres in the frame of the markers; NaN where a marker that the joint needs is lost.
     """
     p: dict[str, Array] = {}
     p["left_hip"], p["right_hip"], p["pelvis"] = _hips(m, calibration)
@@ -236,7 +237,7 @@ def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
     p["head"] = band - BAND_TO_EARS * up
     p["neck"] = 0.7 * m["C7"] + 0.3 * m["CLAV"]
     p["spine3"] = 0.7 * m["T10"] + 0.3 * m["STRN"]
-    # The proportions of the rest skeleton, whose spine and collars no marker shows.
+    # proportions of the rest skeleton, because no marker shows spine and collars
     p["spine1"] = p["pelvis"] + 0.37 * (p["spine3"] - p["pelvis"])
     p["spine2"] = p["pelvis"] + 0.80 * (p["spine3"] - p["pelvis"])
     for side, _ in _SIDES:

@@ -1,6 +1,6 @@
 """Simulated people in front of a simulated depth camera, with the truth known.
 
-`scripts` stages motions from our own kinematic rules (`gait`, `motion`), `camera` films them, `noise` holds the
-error model, and `streams` writes the recordings of ``sim_data/``. The model is fitted to a real Kinect's errors by
-their statistics.
+`scripts` creates motions from our own kinematic rules (`gait`, `motion`), `camera` records them, `noise` is the error
+model, and `streams` writes the recordings of ``sim_data/``. The error model is fitted to the statistics of a real
+Kinect's errors.
 """

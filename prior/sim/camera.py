@@ -1,8 +1,8 @@
-"""A depth camera with a body tracker, filming simulated people.
+"""A simulated depth camera with a body tracker that observes simulated people.
 
-Each joint's line of sight is traced through the bodies (capsules). A hidden joint is guessed or lost; one near a
-silhouette sometimes takes the depth of what is behind or in front of it. All other errors come from the `noise` model;
-their quick part grows with the distance: along the ray with its square, as stereo does, across it in proportion.
+Each joint's line of sight is traced through the bodies' capsules. A hidden joint is guessed or lost. A joint near a
+silhouette sometimes takes the depth of the surface behind or in front of it. All other errors come from the `noise`
+model. Their fast part grows with distance: along the ray with its square, as in stereo, and across the ray linearly.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from steadypose.prior.sim.noise import (
 )
 
 REFERENCE_RANGE = 2.6
-"""Metres: the median distance at which the noise was measured."""
+"""Median distance at which the noise was measured, metres."""
 
 FRAME_ID = "camera_optical_frame"
 
@@ -43,16 +43,16 @@ class Camera:
 
     Attributes:
         position: metres, world.
-        look_at: metres, world: the point in the middle of the image.
+        look_at: metres, world, the point in the middle of the image.
         roll: radians about the line of sight, positive clockwise as seen in the image.
         field_of_view: radians, horizontal and vertical.
-        near: metres in front of the camera within which it sees no depth.
+        near: metres, distance below which it measures no depth.
         background: metres along the line of sight to the wall behind the people.
-        fps: frames a second, nominally.
+        fps: nominal frames per second.
         stamp_jitter: seconds, standard deviation of the frames' times about equal intervals.
         drop_rate: share of frames that never arrive.
-        skeleton: the joints its tracker gives.
-        calibrated: whether its pose in the world is known; if not, only the direction of gravity.
+        skeleton: joint layout of its tracker.
+        calibrated: whether its pose in the world is known; if not, only the direction of gravity is.
     """
 
     position: tuple[float, float, float]
@@ -69,7 +69,7 @@ class Camera:
 
     @property
     def orientation(self) -> Floats:
-        """(3, 3) from the optical frame (x right, y down, z forward) to the world."""
+        """(3, 3) rotation from the optical frame (x right, y down, z forward) to the world."""
         forward = np.subtract(self.look_at, self.position)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -79,7 +79,7 @@ class Camera:
         return np.stack([c * right + s * down, c * down - s * right, forward], axis=-1)
 
     def estimated_pose(self) -> Pose:
-        """The pose that goes into its messages: the true one, or, uncalibrated, only which way is up."""
+        """The pose in its messages: the true pose if calibrated, otherwise only the up direction."""
         if self.calibrated:
             return Pose(np.array(self.position), Rotation.from_matrix(self.orientation).as_quat())
         forward = self.orientation[:, 2]
@@ -87,17 +87,17 @@ class Camera:
         return Pose(np.zeros(3), Rotation.from_matrix(unturn @ self.orientation).as_quat())
 
     def capture_times(self, duration: float, rng: np.random.Generator) -> Floats:
-        """Seconds at which frames were taken and arrive, within 0 to ``duration``."""
+        """Capture times of the frames that arrive, seconds, between 0 and ``duration``."""
         nominal = np.arange(0.1, duration - 0.1, 1.0 / self.fps)
         jitter = np.clip(self.stamp_jitter * rng.standard_normal(len(nominal)), -0.3 / self.fps, 0.3 / self.fps)
-        # Frames are lost singly and in runs: a lost one takes the next along two times in five.
+        # frames are lost singly and in runs: after a lost frame, the next is lost too two times in five
         lost = rng.random(len(nominal)) < 0.6 * self.drop_rate
         for k in range(1, len(lost)):
             lost[k] |= lost[k - 1] and rng.random() < 0.4
         return (nominal + jitter)[~lost]
 
     def in_view(self, points: Floats) -> NDArray[np.bool_]:
-        """Which points (..., 3), optical frame, fall on the image and beyond `near`."""
+        """Which points (..., 3), optical frame, lie in the image and beyond `near`."""
         x, y, z = np.moveaxis(points, -1, 0)
         half = np.tan(np.array(self.field_of_view) / 2)
         return (z > self.near) & (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)
@@ -112,9 +112,9 @@ class Sight:
     """Occlusion of joints (T, J) from a camera.
 
     Attributes:
-        hidden: 0 visible, 1 behind a body, between at its edge.
-        in_front: metres, depth of the occluding surface; infinite where there is none.
-        beside: metres, depth of the nearest other surface that the ray nearly touches; infinite where there is none.
+        hidden: 0 if visible, 1 behind a body, between 0 and 1 at its edge.
+        in_front: metres, depth of the occluding surface; infinite if there is none.
+        beside: metres, depth of the nearest other surface that the ray almost touches; infinite if there is none.
     """
 
     hidden: Floats
@@ -123,9 +123,9 @@ class Sight:
 
 
 def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
-    """Follow the ray to each of ``points`` (T, J, 3) through the capsules of all bodies.
+    """Trace the ray to each of ``points`` (T, J, 3) through the capsules of all bodies.
 
-    A capsule that holds the point itself (a joint inside its own limb) hides nothing.
+    A capsule that contains the point itself (a joint inside its own limb) does not hide it.
     """
     shape = points.shape[:-1]
     hidden, in_front, beside = np.zeros(shape), np.full(shape, np.inf), np.full(shape, np.inf)
@@ -149,7 +149,7 @@ def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
 
 
 def segment_gap(p: Floats, q: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Distance (...) between segments pq and ab (..., 3), and where on pq (0..1) they come nearest.
+    """Distance (...) between segments pq and ab (..., 3), and the parameter on pq (0..1) of the nearest point.
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9.
     """
@@ -174,32 +174,32 @@ def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
 
 _LIMB_ENDS = np.array([n.endswith(("elbow", "wrist", "ankle", "foot", "knee")) for n in JOINTS])
 _ON_TRUNK = np.isin(np.arange(len(JOINTS)), [*TRUNK, *COLLARS])
-_BLEED_RATE = 0.25  # a second: how often a limb's end takes the depth of the wall behind it
-_BLEED_BESIDE_RATE = 1.5  # a second: the same for a ray that grazes other flesh
-_BLEED_DURATION = 0.08  # seconds, mean
-_GUESS_STD = 0.07  # metres: what a tracker makes of a joint it cannot see
-_GUESS_MEMORY = 0.6  # seconds over which such a guess wanders
-_LOST_SHARE = 0.45  # of hidden joints, those the tracker gives up
-_MIN_JOINTS = 0.4  # of a body's joints that must be seen for it to be reported
-_FIND_AFTER = 0.3  # seconds in view before a lost body is found again
-_FORGET_AFTER = 0.8  # seconds out of view after which it comes back under a new id
+_BLEED_RATE = 0.25  # rate at which a limb's end takes the depth of the wall behind it, 1/s
+_BLEED_BESIDE_RATE = 1.5  # the same rate for a ray that grazes another surface, 1/s
+_BLEED_DURATION = 0.08  # mean duration of such an error, seconds
+_GUESS_STD = 0.07  # standard deviation of the tracker's guess of a hidden joint, metres
+_GUESS_MEMORY = 0.6  # correlation time of such a guess, seconds
+_LOST_SHARE = 0.45  # share of hidden joints that the tracker reports as lost
+_MIN_JOINTS = 0.4  # least share of a body's joints that must be visible for it to be reported
+_FIND_AFTER = 0.3  # time in view before a lost body is detected again, seconds
+_FORGET_AFTER = 0.8  # time out of view after which a body gets a new id, seconds
 
 
 def film(
     people: Sequence[Motion], camera: Camera, noise: NoiseModel, rng: np.random.Generator, source: str, start_ns: int
 ) -> list[PoseRaw]:
-    """The camera's tracker output, frame by frame.
+    """Simulate the camera's tracker output, frame by frame.
 
     Args:
-        people: motions that last equally long.
+        people: motions of equal duration.
         camera: the camera.
-        noise: of its tracker.
-        rng: source.
+        noise: error model of its tracker.
+        rng: random generator.
         source: the name of the stream.
         start_ns: stamp of second 0 of the motions.
 
     Returns:
-        frames in the order of their stamps; ``sensor_pose`` as far as the camera is calibrated.
+        Frames in the order of their stamps, with the `Camera.estimated_pose`.
     """
     times = camera.capture_times(min(m.times[-1] for m in people), rng)
     filmed = [m.at(times) for m in people]
@@ -245,7 +245,7 @@ def _track(
     error = error + drawn.quick[:, on_body.joint] * np.concatenate([farther**2, farther, farther], axis=-1)
     scale = drawn.scale[:, on_body.joint] * farther[..., 0]
 
-    # A hidden joint is a guess that wanders; whether the tracker gives it up wanders more slowly still.
+    # a hidden joint is a guess that drifts; whether the tracker reports it as lost changes more slowly
     joints = truth.shape[1]
     guess = _GUESS_STD * stationary(dt, _GUESS_MEMORY, (joints, 3), rng)
     error += hidden[..., None] * guess
@@ -253,14 +253,14 @@ def _track(
     mood = stationary(dt, 2.0, (joints, 1), rng)[..., 0]
     given_up = (hidden > 0.5) & (mood > ndtri(1 - _LOST_SHARE))
 
-    # Depth read beside the joint instead of on it.
+    # depth read beside the joint instead of on it
     ends = _LIMB_ENDS[on_body.joint]
     to_wall = _bursts(dt, ends * _BLEED_RATE * farther[..., 0], rng)
     to_flesh = _bursts(dt, np.where(np.isfinite(view.beside), _BLEED_BESIDE_RATE, 0.0), rng)
     share = rng.uniform(0.3, 1.0, reach.shape)
     error[..., 0] += np.where(to_wall, 0.35 * share * np.maximum(camera.background - reach, 0.0), 0.0)
     error[..., 0] += np.where(to_flesh & np.isfinite(view.beside), share * (np.minimum(view.beside, 1e3) - reach), 0.0)
-    # A tracker that reads the wrong depth does not always know it.
+    # a tracker that reads a wrong depth does not always lower its confidence
     suspects = (to_wall | to_flesh) & (rng.random(reach.shape) < 0.6)
     scale = np.where(suspects, np.maximum(scale, 0.12), scale)
 
@@ -275,13 +275,13 @@ def _track(
 
 
 def as_tracked(hidden: Floats, on_body: Mount) -> Floats:
-    """A trunk is tracked as a whole: an arm across it hides none of its joints, a body in front of it all."""
+    """Treat the trunk as a whole: an arm in front of it hides none of its joints, another body hides all of them."""
     trunk = _ON_TRUNK[on_body.joint]
     return np.where(trunk, np.minimum(hidden, hidden[:, trunk].mean(axis=1, keepdims=True)), hidden)
 
 
 def _swap_rate_factor(person: Motion, eye: Floats) -> Floats:
-    """(T,) factor of `SWAP_RATE`: 1 for a body that faces the camera, 10 for one seen from its side or back."""
+    """(T,) factor on `SWAP_RATE`: 1 for a body that faces the camera, 10 for one seen from its side or back."""
     away = person.root - eye
     away /= np.linalg.norm(away, axis=-1, keepdims=True)
     facing = -(person.orientations[:, 0, :, 0] * away).sum(axis=-1)
@@ -297,7 +297,7 @@ def _exchanged(truth: Floats, on_body: Mount, when: dict[str, NDArray[np.bool_]]
 
 
 def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """(T, J) bursts that begin ``rate`` (T, J) times a second, of mean duration `_BLEED_DURATION`."""
+    """(T, J) random bursts with the rate ``rate`` (T, J) 1/s and the mean duration `_BLEED_DURATION`."""
     begin = rng.random(rate.shape) < 1 - np.exp(-rate * dt[:, None])
     end = rng.random(rate.shape) < 1 - np.exp(-dt[:, None] / _BLEED_DURATION)
     on = np.zeros(rate.shape, dtype=bool)
@@ -307,9 +307,9 @@ def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bo
 
 
 def _found(visible: NDArray[np.bool_], times: Floats) -> NDArray[np.bool_]:
-    """A body is reported once it has been visible for a while, until it is not."""
+    """When a body is reported: once it has been visible for a while, until it is not."""
     since = np.where(visible, 0.0, np.inf)
-    began = times[0] - 1.0  # someone who is there from the start has been there before
+    began = times[0] - 1.0  # a body that is visible at the start was visible before
     for t in range(len(times)):
         if visible[t]:
             if t and not visible[t - 1]:
@@ -319,7 +319,7 @@ def _found(visible: NDArray[np.bool_], times: Floats) -> NDArray[np.bool_]:
 
 
 def _ids(reported: Sequence[NDArray[np.bool_]], times: Floats) -> list[NDArray[np.int64]]:
-    """(T,) track ids of each body: counted up as bodies appear, a new one after a long absence."""
+    """(T,) track ids of each body, counted up as bodies appear; a new id after a long absence."""
     ids = [np.zeros(len(times), dtype=np.int64) for _ in reported]
     current, last_seen, next_id = [0] * len(reported), [-np.inf] * len(reported), 1
     for t, time in enumerate(times):

@@ -1,10 +1,10 @@
-"""Locomotion: the path of the pelvis, and where and when the feet step.
+"""Locomotion: the path of the pelvis, and positions and times of the feet's steps.
 
-A plan moves the pelvis over the floor; the feet follow from it. Time is counted in strides (the *phase*): the left
-foot swings from 0.05 to 0.45 of each stride and the right from 0.55 to 0.95, so that stance lasts 60 % and both
-feet stand around each half stride, where a walk can begin or end. A foot is planted under the place the pelvis
-passes at the middle of its stance, whether the body walks, turns on the spot or does both, and does not move until
-its heel, then its toe, leaves the floor.
+A plan moves the pelvis over the floor, and the feet follow. Time is counted in strides (the *phase*). The left foot
+swings from 0.05 to 0.45 of each stride, the right foot from 0.55 to 0.95. Stance therefore lasts 60 %, and both feet
+stand around each half stride, where a walk can begin or end. A foot is planted under the point that the pelvis passes
+at the middle of the stance, whether the body walks, turns on the spot or does both. It does not move until first its
+heel and then its toe leaves the floor.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from steadypose.prior.body.skeleton import J
 
 
 def minimum_jerk(progress: ArrayLike) -> Floats:
-    """Flash and Hogan (1985)'s course of a reach: from 0 to 1 over ``progress`` 0..1, at rest at both ends."""
+    """Minimum-jerk profile of Flash and Hogan (1985): from 0 to 1 over ``progress`` 0..1, at rest at both ends."""
     u = np.clip(np.asarray(progress, dtype=np.float64), 0.0, 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
 
 
 @dataclass(frozen=True)
 class Key:
-    """Between ``start`` and ``end`` (seconds) a track goes over to ``value``."""
+    """A change of a track to ``value`` between ``start`` and ``end``, seconds."""
 
     start: float
     end: float
@@ -39,15 +39,15 @@ class Key:
 
 
 def track(times: Floats, initial: ArrayLike, keys: Sequence[Key]) -> Floats:
-    """A value that goes from key to key, twice continuously differentiable.
+    """Interpolate a value from key to key, twice continuously differentiable.
 
-    Each key adds its difference from the one before, on a minimum-jerk course. Keys that overlap in time blend:
-    the track then passes near the first without stopping, as a hand does at a via-point.
+    Each key adds its difference from the previous key along a minimum-jerk profile. Keys that overlap in time blend:
+    the track passes near the first without stopping, like a hand at a via-point.
 
     Args:
         times: (T,) seconds.
         initial: (...) value before the first key.
-        keys: in order.
+        keys: keys in order.
 
     Returns:
         (T, ...).
@@ -63,12 +63,12 @@ def track(times: Floats, initial: ArrayLike, keys: Sequence[Key]) -> Floats:
 
 
 def drift(rng: np.random.Generator, times: Floats, std: ArrayLike, slowest_s: float, fastest_s: float) -> Floats:
-    """Aimless smooth motion: six sinusoids a channel with random periods and phases.
+    """Random smooth motion: six sinusoids per channel with random periods and phases.
 
     Args:
-        rng: source of the periods and phases.
+        rng: random generator of the periods and phases.
         times: (T,) seconds.
-        std: (C,) standard deviation of each channel over a long time.
+        std: (C,) long-term standard deviation of each channel.
         slowest_s: longest period in seconds.
         fastest_s: shortest period in seconds.
 
@@ -79,26 +79,27 @@ def drift(rng: np.random.Generator, times: Floats, std: ArrayLike, slowest_s: fl
     waves = 6
     period = np.exp(rng.uniform(np.log(fastest_s), np.log(slowest_s), (waves, len(std))))
     phase = rng.uniform(0.0, 2 * np.pi, (waves, len(std)))
-    # Slow sway is wider than fast tremble: amplitude in proportion to the period.
+    # slow sway is wider than fast tremor: amplitudes are proportional to periods
     amplitude = period / np.sqrt((period**2).sum(axis=0) / 2)
     angle = 2 * np.pi * times[:, None, None] / period + phase
     return std * (amplitude * np.sin(angle)).sum(axis=1)
 
 
 RATE = 120
-"""Frames a second at which motions are made."""
+"""Frame rate of the simulated motions, frames per second."""
 
 LIFT, LAND = 0.05, 0.45
-"""Phase at which the left foot's toe leaves the floor and its heel comes down; the right foot's is half a stride on."""
+"""Phases at which the left foot's toe leaves the floor and its heel lands; the right foot is half a stride later."""
 HEEL_OFF_BEFORE_LIFT = 0.22
 FLAT_AFTER_LAND = 0.08
 UNDER_AFTER_LAND = 0.255
-"""The pelvis passes over the ankle a little before the middle of stance: the leg trails more than it leads."""
+"""Phase from landing until the pelvis passes over the ankle, a little before mid-stance, as legs trail more than
+lead."""
 
-_RAMP_S = 1.0  # from standing to full speed
-_REFERENCE_SPEED = 1.2  # m/s, at which an adult makes 0.9 strides a second
+_RAMP_S = 1.0  # time from standing to full speed, seconds
+_REFERENCE_SPEED = 1.2  # speed at which an adult makes 0.9 strides per second, m/s
 _REFERENCE_CADENCE = 0.9
-_TURN_ARM = 0.8  # metres: a turn on the spot costs as many steps as walking this radius
+_TURN_ARM = 0.8  # radius of a walked arc that takes as many steps as a turn on the spot, metres
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Plan:
         yaw: (T,) radians, unwrapped.
         phase: (T,) strides made.
         speed: (T,) m/s along the path.
-        moves: for each walk or turn, the slice of frames it takes.
+        moves: slice of frames of each walk or turn.
     """
 
     times: Floats
@@ -145,12 +146,12 @@ class Plan:
     moves: tuple[slice, ...]
 
     def when(self, seconds: float) -> int:
-        """Index of the frame at a time."""
+        """Return the index of the frame at a time."""
         return min(round(seconds * RATE), len(self.times) - 1)
 
 
 def plan(start: tuple[float, float], yaw: float, parts: Sequence[Stand | Walk | Turn]) -> Plan:
-    """Lay out a plan from where the body starts, facing ``yaw`` radians, part after part."""
+    """Build a plan part by part from the body's start position, facing ``yaw`` radians."""
     place, facing, strides = np.array(start, dtype=np.float64), float(yaw), 0.0
     columns: list[tuple[Floats, Floats, Floats, Floats]] = []
     moves: list[slice] = []
@@ -175,7 +176,7 @@ def _walk(start: Floats, facing: float, part: Walk) -> tuple[Floats, Floats, Flo
     points = np.vstack([start, np.asarray(part.points, dtype=np.float64)])
     chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     ahead = np.array([np.cos(facing), np.sin(facing)])
-    ends: Any = ((1, ahead), (2, np.zeros(2)))  # sets out where the body faces, arrives without curving
+    ends: Any = ((1, ahead), (2, np.zeros(2)))  # starts in the direction the body faces, ends without curvature
     curve = CubicSpline(chord, points, bc_type=ends)
     fine = np.linspace(0.0, chord[-1], max(50, int(400 * chord[-1])))
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(fine), axis=0), axis=1))])
@@ -199,11 +200,11 @@ def _turn(place: Floats, facing: float, part: Turn) -> tuple[Floats, Floats, Flo
 
 
 def _phase(before: float, speed: Floats, heading: Floats) -> Floats:
-    """Strides, from half stride to half stride; slow steps are short rather than rare."""
+    """Return strides, from half stride to half stride. Slow steps are short, not rare."""
     effort = np.hypot(speed, _TURN_ARM * np.gradient(heading) * RATE)
     cadence = _REFERENCE_CADENCE * (effort / _REFERENCE_SPEED) ** 0.4
     strides = np.cumsum(cadence) / RATE
-    halves = max(2, round(2 * float(strides[-1]) + 0.3))  # rather a short step than a long one
+    halves = max(2, round(2 * float(strides[-1]) + 0.3))  # prefer a short step to a long one
     return before + strides / strides[-1] * halves / 2
 
 
@@ -213,10 +214,10 @@ class FootTrack:
 
     Attributes:
         ankle: (T, 3) metres, world.
-        yaw: (T,) radians, where the foot points.
+        yaw: (T,) radians, direction of the foot.
         pitch: (T,) radians, positive with the toe down.
-        heel_planted: (T,) the ankle does not move.
-        toe_planted: (T,) the ball of the foot does not move.
+        heel_planted: (T,) whether the ankle stays in place.
+        toe_planted: (T,) whether the ball of the foot stays in place.
     """
 
     ankle: Floats
@@ -227,12 +228,12 @@ class FootTrack:
 
     @property
     def rotation(self) -> Floats:
-        """(T, 3, 3) world orientation of the foot; identity is flat on the floor, facing +x."""
+        """(T, 3, 3) world orientation of the foot; the identity is flat on the floor, facing +x."""
         return yaw_matrix(self.yaw) @ pitch_matrix(self.pitch)
 
 
 def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
-    """The steps of one foot that a plan asks for.
+    """Compute the steps of one foot that a plan needs.
 
     Args:
         plan: the pelvis over the floor.
@@ -245,7 +246,7 @@ def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
     toe_out = sign * np.radians(7.0)
 
     def planted(frame: float, width: float) -> tuple[Floats, float]:
-        """Ankle and yaw of a foot that stands under the pelvis as it is at a frame (which may lie between two)."""
+        """Return ankle and yaw of a foot under the pelvis at a frame, which may be fractional."""
         x, y, yaw = (
             float(np.interp(frame, np.arange(len(plan.yaw)), v)) for v in (plan.xy[:, 0], plan.xy[:, 1], plan.yaw)
         )
@@ -300,7 +301,7 @@ def pitch_matrix(angle: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _Step:
-    """One swing of a foot, from where its heel comes off to where it lies flat again; times in frames."""
+    """One swing of a foot, from heel-off until it is flat again; times in frames."""
 
     heel_off: float
     lift: float
@@ -311,7 +312,7 @@ class _Step:
     sole: Floats
 
     def pitch(self, t: Floats) -> Floats:
-        """The heel rises about the toe until it lifts, the toe is raised before the heel lands, then comes down."""
+        """Pitch: the heel rises about the toe until toe-off; the toe is raised before the heel lands, then lowered."""
         stride = float(np.linalg.norm(self.target[0][:2] - self.origin[0][:2]))
         vigour = min(1.0, stride / 1.2)
         swing = self.land - self.lift

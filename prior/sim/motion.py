@@ -1,4 +1,4 @@
-"""From intentions to a whole body's motion: the pelvis follows the plan, limbs reach where they should by IK."""
+"""Computes a body's motion from an intent: the pelvis follows the plan, limbs reach by inverse kinematics."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from steadypose.prior.sim.gait import RATE, FootTrack, Plan, drift, foot_track
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
-"""Which way the body's left axis goes."""
+"""Sign of each side along the body's left axis."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One person's motion, with nothing hidden.
+    """One person's true motion.
 
     Attributes:
         times: (T,) seconds, evenly spaced.
         offsets: (22, 3) metres, the bones.
-        root: (T, 3) metres, the pelvis in the world.
-        rotations: (T, 22, 3, 3) local rotations; that of the pelvis is its orientation in the world.
+        root: (T, 3) metres, position of the pelvis in the world.
+        rotations: (T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world.
         contacts: (T, 8) which of `CONTACT_JOINTS` rest on the floor.
     """
 
@@ -53,16 +53,16 @@ class Motion:
 
     @property
     def orientations(self) -> Floats:
-        """(T, 22, 3, 3) each joint's orientation in the world."""
+        """(T, 22, 3, 3) orientations of the joints in the world."""
         return self._posed[1]
 
     @property
     def velocity(self) -> Floats:
-        """(T, 3) m/s of the pelvis, world."""
+        """(T, 3) m/s, velocity of the pelvis, world."""
         return np.gradient(self.root, self.times, axis=0)
 
     def at(self, times: Floats) -> Motion:
-        """The motion at other times (S,) within its own: rotations slerped, so that bones keep their lengths."""
+        """Resample the motion at times (S,) within its duration. Rotations are slerped, so bones keep their lengths."""
         if times.min() < self.times[0] - 1e-9 or times.max() > self.times[-1] + 1e-9:
             raise ValueError(
                 f"times {times.min():.3f} to {times.max():.3f} s leave the motion, which lasts from "
@@ -82,8 +82,8 @@ class ArmAction:
 
     Attributes:
         weight: (T,) 0 for the swing, 1 for this action.
-        wrist: (T, 3) metres or (3,), in ``frame``.
-        pole: (T, 3) or (3,), in the chest's frame: where the elbow points.
+        wrist: (T, 3) or (3,) metres, target of the wrist in ``frame``.
+        pole: (T, 3) or (3,) direction in which the elbow points, in the chest's frame.
         frame: "world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame,
             origin at this arm's shoulder, in arm lengths.
     """
@@ -96,15 +96,15 @@ class ArmAction:
 
 @dataclass
 class Intent:
-    """All that a script decides; what it leaves out is at rest.
+    """Everything that a script controls; the rest of the body is at rest.
 
     Attributes:
-        plan: where the body goes.
+        plan: path of the body.
         shift: (T, 3) metres, pelvis relative to the plan in the heading frame; z relative to standing.
-        tilt: (T,) radians, pelvis bends forward.
+        tilt: (T,) radians, forward tilt of the pelvis.
         torso: (T, 3) radians: roll (to the right positive), pitch (forward positive), yaw (to the left positive).
         gaze: (T, 2) radians: yaw and pitch of the head beyond the torso's.
-        arms: what each arm does, in order; a later action takes over from an earlier one.
+        arms: actions of each arm, in order; a later action overrides an earlier one.
     """
 
     plan: Plan
@@ -121,15 +121,15 @@ class Intent:
 
 
 def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion:
-    """Carry out an intent with a given body.
+    """Perform an intent with a given body.
 
-    The pelvis sways, lists and turns with the steps and hangs as high as the legs allow; the chest turns against
-    it; the arms swing from the shoulders; standing still, the body drifts as people do. Feet follow `foot_track`.
+    The pelvis sways, tilts and turns with the steps, as high as the legs allow. The chest turns against it, and the
+    arms swing from the shoulders. A body that stands still drifts slightly. Feet follow `foot_track`.
 
     Args:
-        intent: what to do.
+        intent: the intent.
         offsets: (22, 3) metres, the person's bones.
-        rng: source of the idle drift.
+        rng: random generator of the idle drift.
     """
     plan = intent.plan
     n = len(plan.times)
@@ -163,7 +163,7 @@ def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion
     for joint in ("spine1", "spine2", "spine3"):
         rotations[:, J[joint]] = _bend(torso / 3)
     gaze = intent.gaze + idle_gaze
-    # The head stays more upright, and turns less, than the chest below it.
+    # the head is more upright, and turns less, than the chest
     nod = gaze[:, 1] - 0.5 * (torso[:, 1] + intent.tilt)
     head = np.stack([-0.6 * torso[:, 0], nod, gaze[:, 0] - 0.6 * torso[:, 2]], axis=-1)
     for joint, share in (("neck", 0.45), ("head", 0.55)):
@@ -185,13 +185,13 @@ def _bend(roll_pitch_yaw: Floats) -> Floats:
 
 
 def _standing_height(offsets: Floats) -> float:
-    """Metres of the pelvis above the floor, standing upright with knees all but straight."""
+    """Return the height of the pelvis above the floor, standing upright with almost straight knees, metres."""
     chain = [J["left_hip"], J["left_knee"], J["left_ankle"], J["left_foot"]]
     return TOE_HEIGHT - float(offsets[chain, 2].sum()) - 0.008
 
 
 def _lowering(root: Floats, pelvis: Floats, feet: Mapping[Side, FootTrack], offsets: Floats) -> Floats:
-    """(T,) metres by which the pelvis must sink so that no leg is asked for more than its length, smoothly."""
+    """(T,) metres by which the pelvis must sink, smoothly, so that no leg must exceed its length."""
     need = np.zeros(len(root))
     for side in SIDES:
         hip = root + pelvis @ offsets[J[f"{side}_hip"]]
@@ -199,7 +199,7 @@ def _lowering(root: Floats, pelvis: Floats, feet: Mapping[Side, FootTrack], offs
         across = np.linalg.norm(hip[:, :2] - feet[side].ankle[:, :2], axis=1)
         allowed = feet[side].ankle[:, 2] + np.sqrt(np.maximum(reach**2 - across**2, 0.01))
         need = np.maximum(need, hip[:, 2] - allowed)
-    # The maximum is taken over more than the Gaussian reaches, so the smoothed curve stays above the need.
+    # the maximum's window is wider than the Gaussian, so the smoothed curve is never too low
     half = round(0.07 * RATE)
     highest = maximum_filter1d(need, 2 * half + 1, mode="nearest")
     return gaussian_filter1d(highest, half / 2.5, mode="nearest", radius=half)
@@ -210,18 +210,18 @@ def _lengths(offsets: Floats, middle: str, end: str) -> Floats:
 
 
 def two_bone(start: Floats, goal: Floats, pole: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
-    """Analytic two-bone IK.
+    """Analytic two-bone inverse kinematics.
 
-    A goal nearer than the limb can fold, or farther than 99.9 % of its length, is met as far as possible.
+    A goal nearer than the limb can fold, or farther than 99.9 % of its length, is approached as far as possible.
 
     Args:
-        start: (T, 3) metres, the shoulder or hip.
-        goal: (T, 3) metres, where wrist or ankle should be.
+        start: (T, 3) metres, position of shoulder or hip.
+        goal: (T, 3) metres, target of wrist or ankle.
         pole: (T, 3) direction in which elbow or knee points.
-        lengths: (2,) metres of the two bones.
+        lengths: (2,) metres, lengths of the two bones.
 
     Returns:
-        directions of both bones (T, 3) each, and the hinge's axis (T, 3), about which the limb flexes.
+        Directions of both bones, (T, 3) each, and the hinge's axis (T, 3), about which the limb flexes.
     """
     upper, lower = lengths
     along = goal - start
@@ -238,7 +238,7 @@ def two_bone(start: Floats, goal: Floats, pole: Floats, lengths: Floats) -> tupl
 
 
 def _oriented(direction: Floats, hinge: Floats, rest_direction: Floats, rest_pole: Floats) -> Floats:
-    """World rotations (T, 3, 3) that take a bone and its hinge from the rest pose to where they should be."""
+    """Return world rotations (T, 3, 3) that turn a bone and its hinge from the rest pose to the given directions."""
     rest = rest_direction / np.linalg.norm(rest_direction)
     rest_hinge = np.cross(rest_pole, rest)
     rest_hinge /= np.linalg.norm(rest_hinge)
@@ -250,7 +250,7 @@ def _oriented(direction: Floats, hinge: Floats, rest_direction: Floats, rest_pol
 @dataclass(frozen=True)
 class _Limb:
     joints: tuple[str, str, str]
-    rest_pole: Floats  # where elbow or knee points in the rest pose
+    rest_pole: Floats  # direction of elbow or knee in the rest pose
 
 
 _LEG = _Limb(("hip", "knee", "ankle"), np.array([1.0, 0.0, 0.0]))
@@ -280,7 +280,7 @@ def _limb(
 def _leg(rotations: Floats, root: Floats, offsets: Floats, side: Side, foot: FootTrack, plan: Plan) -> None:
     sign = SIGN[side]
     hip = root + rotations[:, 0] @ offsets[J[f"{side}_hip"]]
-    # The knee points half way between pelvis and foot, and a little outward.
+    # the knee points between the directions of pelvis and foot, and a little outward
     lag = np.angle(np.exp(1j * (foot.yaw - plan.yaw)))
     pole = yaw_matrix(plan.yaw + lag / 2) @ np.array([1.0, 0.08 * sign, 0.0])
     shin = _limb(rotations, side, _LEG, rotations[:, 0], hip, foot.ankle, pole, offsets)
@@ -288,7 +288,7 @@ def _leg(rotations: Floats, root: Floats, offsets: Floats, side: Side, foot: Foo
 
 
 def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: Intent, forward: Floats) -> None:
-    """Collar, shoulder and elbow; ``forward`` (T,) is the swing: 1 is as far forward as in a walk at 1.2 m/s."""
+    """Set collar, shoulder and elbow. ``forward`` (T,) is the swing; 1 is the farthest forward in a walk at 1.2 m/s."""
     sign = SIGN[side]
     collar, shoulder = J[f"{side}_collar"], J[f"{side}_shoulder"]
     lengths = _lengths(offsets, f"{side}_elbow", f"{side}_wrist")
@@ -298,7 +298,7 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
         return positions[:, shoulder], world[:, collar], world[:, J["spine3"]]
 
     at, _, chest = place()
-    # Arms hang by gravity, however the chest leans.
+    # arms hang by gravity, also if the chest leans
     wrist = at + _apply(yaw_matrix(heading(chest)), _hanging(forward, sign, lengths))
     pole = chest @ np.array([-1.0, 0.25 * sign, -0.2])
     for action in intent.arms[side]:
@@ -311,7 +311,7 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
         weight = action.weight[:, None]
         wrist = wrist + weight * (goal - wrist)
         pole = pole + weight * (_apply(chest, action.pole) - pole)
-    # The shoulder girdle helps an arm that is raised (scapulohumeral rhythm): above the horizontal it rises by a third.
+    # the shoulder girdle rises with a raised arm (scapulohumeral rhythm): above the horizontal, by a third
     raised = _apply(np.swapaxes(chest, -1, -2), wrist - at)
     lift = np.radians(18.0) * _smooth_ramp((raised[:, 2] / lengths.sum() + 0.4) / 1.3)
     rotations[:, collar] = Rotation.from_rotvec(np.multiply.outer(sign * lift, [1.0, 0.0, 0.0])).as_matrix()
@@ -321,7 +321,7 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
 
 
 def _within_reach(vector: Floats, full: float) -> Floats:
-    """Vectors (T, 3) shortened, from 92 % of a limb's ``full`` length on ever more: it does not snap straight."""
+    """Shorten vectors (T, 3), increasingly beyond 92 % of a limb's ``full`` length, so that it never snaps straight."""
     far = np.linalg.norm(vector, axis=-1, keepdims=True)
     free, room = 0.92 * full, 0.065 * full
     soft = free + room * (1 - np.exp(-np.maximum(far - free, 0) / room))
@@ -338,7 +338,7 @@ def _smooth_ramp(u: Floats) -> Floats:
 
 
 def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:
-    """(T, 3) wrist from the shoulder, heading frame, of an arm that hangs and swings by ``forward`` (T,)."""
+    """(T, 3) wrist relative to the shoulder, heading frame, of a hanging arm that swings by ``forward`` (T,)."""
     shoulder = np.radians(4.0) + np.radians(20.0) * forward
     elbow = np.radians(16.0) + np.radians(10.0) * (forward + np.sqrt(forward**2 + 0.04))
 

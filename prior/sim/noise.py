@@ -1,6 +1,6 @@
-"""The errors of a depth camera's body tracker, as a random process with parameters fitted to a real Kinect.
+"""Error model of a depth camera's body tracker: a random process with parameters fitted to a real Kinect.
 
-For each joint:
+Each joint has
 
 - an **offset**, constant for a session, and a **bias** that drifts with the *distance the joint travels*, not with
   time: a still joint keeps its error, whatever the frame rate;
@@ -8,11 +8,11 @@ For each joint:
   a correlation time of half a second), which makes its tails heavy;
 - **jumps**: the joint is displaced for a frame or for seconds (a wrong surface, the other limb), then returns;
 - **swaps** of left and right limbs for short bursts;
-- a share of all this that all joints of the body have in common.
+- a share of each error that all joints of the body have in common.
 
 Errors are drawn in the frame of the camera's ray to the joint: along it, to its right, and up. The parameters were
-fitted once, by their statistics, to UI-PRMD's Kinect beside its Vicon (`training/recipes/sensor_noise.py` of commit
-d5d5ec8), and are kept as a result.
+fitted once to the statistics of UI-PRMD's Kinect relative to its Vicon (`training/recipes/sensor_noise.py` of commit
+d5d5ec8).
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 
 KINECT_NOISE = Path(__file__).with_name("kinect_noise.json")
-"""The parameters fitted to UI-PRMD's Kinect, with their provenance."""
+"""File of the parameters fitted to UI-PRMD's Kinect, with their provenance."""
 
 SWAP_GROUPS: Mapping[str, tuple[int, ...]] = {
     group: tuple(J[f"{side}_{part}"] for side in ("left", "right") for part in parts)
     for group, parts in {"arms": ("elbow", "wrist"), "legs": ("knee", "ankle", "foot")}.items()
 }
-"""Joints whose sides are exchanged together."""
+"""Groups of joints whose sides are exchanged together."""
 
 
 SWAP_RATE: Mapping[str, float] = {"arms": 0.005, "legs": 0.01}
 SWAP_DURATION = 0.15
-"""Swaps a second, and their mean duration in seconds; assumed, as UI-PRMD's people face the camera and have one swapped
-frame in 47 minutes."""
+"""Rate of swaps, 1/s, and their mean duration, seconds. They are assumed: UI-PRMD's people face the camera, and have
+one swapped frame in 47 minutes."""
 
 SPREAD_SPEED = 0.2
-"""m/s at which the spread of the fast noise is midway between that of a joint at rest and in motion."""
+"""Speed at which the spread of the fast noise is midway between a joint at rest and one in motion, m/s."""
 
 FASTEST = 1.0
-"""m/s above which the noise grows no further: the recordings hold too little faster motion to fit it."""
+"""Speed above which the noise does not grow, m/s; the recordings contain too little faster motion for a fit."""
 
 LONGEST_JUMP = 1.2
-"""Metres: a joint farther off would not be assigned to the body."""
+"""Longest jump, metres; a joint farther away would not be assigned to the body."""
 
 
 @dataclass(frozen=True)
@@ -61,24 +61,24 @@ class NoiseModel:
     Attributes:
         offset: (22, 3) metres, standard deviation of the session's offset.
         bias: (22, 3) metres, standard deviation of the drifting bias (median of its log-normal spread).
-        bias_length: metres of travel after which the bias is forgotten (1/e).
-        bias_inertia: seconds that the bias lags behind, so that a fast joint does not shake with it.
-        session_spread: standard deviation of the log of a joint's error scale in a session: offset, bias and fast noise
-            are proportional to it, the rate of jumps to its square.
+        bias_length: metres of travel over which the bias decays (1/e).
+        bias_inertia: seconds by which the bias lags, so that it does not shake a fast joint.
+        session_spread: standard deviation of the logarithm of a joint's error scale in a session. Offset, bias and fast
+            noise are proportional to this scale, the rate of jumps to its square.
         fast: (22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread).
         fast_memory: seconds, correlation time of the fast noise.
-        speed_floor: m/s below which speed no longer matters.
-        speed_exponent: (22,) the fast noise goes with (speed_floor + speed) to this power.
-        fast_spread_still: standard deviation of the log of the fast noise's size, of a joint at rest.
-        fast_spread_moving: the same well above `SPREAD_SPEED`.
+        speed_floor: m/s, speed below which the fast noise is constant.
+        speed_exponent: (22,) exponent; the fast noise is proportional to (speed_floor + speed) to this power.
+        fast_spread_still: standard deviation of the logarithm of the fast noise's size for a joint at rest.
+        fast_spread_moving: the same for speeds well above `SPREAD_SPEED`.
         fast_spread_memory: seconds, correlation time of that size.
         shared: share of the variance of bias and fast noise that all joints have in common.
-        jump_rate: (22,) jumps a second.
+        jump_rate: (22,) 1/s, rate of jumps.
         jump_minimum: metres, length of the shortest jumps.
-        jump_tail: exponent of the Pareto law of their lengths.
+        jump_tail: exponent of the Pareto distribution of their lengths.
         jump_short: seconds, mean duration of a short jump.
-        jump_long: seconds, mean duration of a long one.
-        jump_short_share: share of short ones.
+        jump_long: seconds, mean duration of a long jump.
+        jump_short_share: share of short jumps.
     """
 
     offset: Floats
@@ -106,7 +106,7 @@ class NoiseModel:
         """Read the ``parameters`` of a JSON file such as `KINECT_NOISE`.
 
         Raises:
-            ValueError: the file lacks a parameter or has one too many.
+            ValueError: the file lacks a parameter or has an unknown one.
         """
         parameters = json.loads(path.read_text())["parameters"]
         names = {f.name for f in fields(cls)}
@@ -123,8 +123,8 @@ class Errors:
     Attributes:
         steady: (..., T, 22, 3) metres along the ray, to its right, up: offset and bias.
         quick: (..., T, 22, 3) metres, fast noise and jumps, which grow with the distance from the camera.
-        scale: (..., T, 22) metres, the error that a tracker could know of: the fast noise's scale, half of a jump, a
-            tenth of the steady error.
+        scale: (..., T, 22) metres, the error that a tracker could estimate: the fast noise's scale, half of a jump, and
+            a tenth of the steady error.
     """
 
     steady: Floats
@@ -136,9 +136,9 @@ def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: Noi
     """Sample the errors of a tracker, except for swaps, from the stationary distribution.
 
     Args:
-        travel: (..., T, 22) metres each joint moved since the frame before.
-        dt: (T,) seconds since the frame before (the first serves for the joints' speed only).
-        rng: source.
+        travel: (..., T, 22) metres moved by each joint since the last frame.
+        dt: (T,) seconds since the last frame; the first value is only used for the joints' speed.
+        rng: random generator.
         model: parameters.
     """
     joint = (*travel.shape, 1)
@@ -146,7 +146,7 @@ def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: Noi
     time = dt[:, None, None]
     once = (*travel.shape[:-2], 1, travel.shape[-1], 1)
 
-    # Some sessions, and some joints in them, are worse than others in everything.
+    # all errors are larger in some sessions, and for some joints in them
     size = np.exp(model.session_spread * _bounded(_with_shared(rng, once, 0.5)))
     offset = size * model.offset * _with_shared(rng, (*once[:-1], 3), model.shared)
     wander = _recursion(np.exp(-travel[..., None] / model.bias_length), _with_shared(rng, vector, model.shared))
@@ -170,12 +170,12 @@ def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: Noi
 
 
 def _bounded(normal: Floats) -> Floats:
-    """Cut at two standard deviations: the log-normals' far tails are not in the data."""
+    """Clip at two standard deviations, because the data do not show the log-normals' far tails."""
     return np.clip(normal, -2.0, 2.0)
 
 
 def _with_shared(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> Floats:
-    """Standard normal (..., 22, C), of which a ``share`` of the variance is the same for all joints."""
+    """Standard normal (..., 22, C); all joints have a ``share`` of the variance in common."""
     common = rng.standard_normal((*shape[:-2], 1, shape[-1]))
     return np.sqrt(share) * common + np.sqrt(1 - share) * rng.standard_normal(shape)
 
@@ -183,7 +183,7 @@ def _with_shared(rng: np.random.Generator, shape: tuple[int, ...], share: float)
 def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Floats:
     """x[t] = a x[t-1] + g s[t] along axis -3, from x[0] = s[0].
 
-    With the gain left out, sqrt(1 - a²), white noise of unit variance gives a stationary process of unit variance.
+    The default gain is sqrt(1 - a²), so that white noise of unit variance gives a stationary process of unit variance.
     """
     steps = np.moveaxis(np.broadcast_to(decay, source.shape), -3, 0)
     gains = np.sqrt(1 - steps**2) if gain is None else np.moveaxis(np.broadcast_to(gain, source.shape), -3, 0)
@@ -196,12 +196,12 @@ def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Flo
 
 
 def time_correlated(noise: Floats, memory: Floats | float, axis: int = 0) -> Floats:
-    """White noise made a stationary AR(1) process of the same variance, in place.
+    """Convert white noise to a stationary AR(1) process of the same variance, in place.
 
     Args:
-        noise: one frame after the other along ``axis``.
-        memory: correlation from a frame to the next; broadcasts against a frame.
-        axis: of time.
+        noise: white noise, with frames along ``axis``.
+        memory: correlation from one frame to the next; broadcasts against a frame.
+        axis: axis of time.
     """
     frames = np.moveaxis(noise, axis, 0)
     for t in range(1, len(frames)):
@@ -215,7 +215,7 @@ def stationary(dt: Floats, memory: float, shape: tuple[int, int], rng: np.random
 
 
 def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Generator, model: NoiseModel) -> Floats:
-    """Displacements (..., T, 22, 3) metres that begin ``rate`` (..., 22) times a second; 0 in between."""
+    """Return displacements (..., T, 22, 3) metres by jumps with the rate ``rate`` (..., 22) 1/s; 0 between them."""
     frames = shape[-3]
     state = (*shape[:-3], shape[-2])
     mean_duration = model.jump_short_share * model.jump_short + (1 - model.jump_short_share) * model.jump_long
@@ -223,7 +223,7 @@ def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Gene
     displaced, stay = np.zeros((*state, 3)), np.ones(state)
     out = np.empty((frames, *state, 3))
     for t in range(frames):
-        # The first frame falls into a running jump as often as a frame does; long ones fill more of the time.
+        # the first frame lies in a jump as often as any frame; long jumps take up more of the time
         chance = busy if t == 0 else 1 - np.exp(-rate * dt[t])
         short = model.jump_short_share * (model.jump_short / mean_duration if t == 0 else 1.0)
         displaced[rng.random(state) > stay ** dt[t]] = 0.0
@@ -241,7 +241,7 @@ def _jumps(shape: tuple[int, ...], dt: Floats, rate: Floats, rng: np.random.Gene
 
 
 def ray_axes(rays: Floats) -> Floats:
-    """(..., 3, 3) orthonormal axes of rays (..., 3), world z up: rows along the ray, to its right, up."""
+    """(..., 3, 3) orthonormal axes of rays (..., 3), world z up. Rows point along the ray, to its right, and up."""
     along = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     right = np.cross(along, [0.0, 0.0, 1.0])
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-9)
@@ -249,7 +249,7 @@ def ray_axes(rays: Floats) -> Floats:
 
 
 def travelled(positions: Floats) -> Floats:
-    """(..., T, 22) metres from the frame before; the first frame takes the second's."""
+    """(..., T, 22) metres moved since the last frame; the first frame has the second's value."""
     step = np.linalg.norm(np.diff(positions, axis=-3), axis=-1)
     return np.concatenate([step[..., :1, :], step], axis=-2) if step.shape[-2] else np.zeros(positions.shape[:-1])
 
@@ -257,7 +257,7 @@ def travelled(positions: Floats) -> Floats:
 def swapped(
     dt: Floats, batch: tuple[int, ...], rng: np.random.Generator, rate_factor: Floats | float = 1.0
 ) -> dict[str, NDArray[np.bool_]]:
-    """When left and right are exchanged: (T, *batch) for each of `SWAP_GROUPS`.
+    """Return when left and right are exchanged, (T, *batch) for each of `SWAP_GROUPS`.
 
     ``rate_factor`` (T, *batch) multiplies `SWAP_RATE`, for a body seen from its side.
     """
@@ -276,9 +276,9 @@ def swapped(
 
 
 def confidence_of(scale: Floats, rng: np.random.Generator) -> Floats:
-    """Confidence that a tracker states: decreasing with ``scale`` (see `Errors`), 0.5 at 4 cm, with noise of its own.
+    """Return a tracker's confidence. It decreases with ``scale`` (see `Errors`), is 0.5 at 4 cm, and is noisy.
 
-    UI-PRMD has no confidences, so this is assumed, not fitted: informative, and sometimes wrong.
+    UI-PRMD has no confidences, so this is assumed and not fitted: it is informative, and sometimes wrong.
     """
     logit = 1.6 * np.log(0.04 / np.maximum(scale, 1e-4)) + 0.8 * rng.standard_normal(scale.shape)
     return 1.0 / (1.0 + np.exp(-logit))

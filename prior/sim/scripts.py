@@ -1,7 +1,7 @@
-"""The scenes: each function returns the motions of all people of one scene, from a seed.
+"""The simulated scenes. Each function returns the motions of all people of one scene, from a random generator.
 
-The stage is the world's floor. The camera stands near the origin and looks along +x, so a person who faces it
-has a yaw of pi, and stands 2 to 4 m away.
+People move on the world's floor. The camera is near the origin and looks along +x, so a person who faces it has a yaw
+of pi. People are 2 to 4 m away.
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ def reach(rng: np.random.Generator) -> list[Motion]:
 
 
 def _reach_for(intent: Intent, offsets: Floats, side: Side, start: float, target: Floats, t: Floats) -> None:
-    """A reach to ``target`` (metres from the pelvis, heading frame), held, and back: 3 s in all.
+    """Add a reach to ``target`` (metres from the pelvis, heading frame), a hold, and the return, 3 s in total.
 
-    What lies beyond the arm's length is reached by leaning, bending the knees and turning the trunk.
+    Targets beyond the arm's length are reached by leaning, bending the knees and turning the trunk.
     """
     sign = SIGN[side]
     weight = _during(t, start, start + 3.0, 1.0)
-    # The trunk sets out a little before the hand and returns a little later.
+    # the trunk starts a little before the hand and returns a little later
     body = _during(t, start - 0.15, start + 3.15, 1.15)
     arm = float(np.linalg.norm(offsets[[J["left_elbow"], J["left_wrist"]]], axis=1).sum())
     trunk = offsets[[J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "left_shoulder")]].sum(axis=0)
@@ -107,7 +107,7 @@ def _reach_for(intent: Intent, offsets: Floats, side: Side, start: float, target
     intent.shift += body[:, None] * np.array(sway)
     gaze = np.array([np.arctan2(target[1], max(target[0], 0.3)), np.clip(-target[2] + 0.35, -0.4, 0.7)])
     intent.gaze += body[:, None] * gaze * 0.5
-    # Targets are places in the room: fixed to the plan, which stands still, not to the pelvis, which leans.
+    # targets are fixed to the plan, which stands still, not to the pelvis, which leans
     heading = intent.plan.yaw[intent.plan.when(start)]
     c, s = np.cos(heading), np.sin(heading)
     x, y = intent.plan.xy[intent.plan.when(start)]
@@ -137,11 +137,11 @@ def sit_rise(rng: np.random.Generator) -> list[Motion]:
     for down, up, fast in ((begin + 0.3, begin + 5.7, 1.0), (begin + 7.6, begin + 10.2, 0.85)):
         take = 1.7 * fast
         seated += minimum_jerk((t - down) / take) - minimum_jerk((t - up) / take)
-        # One bows before the pelvis falls back, and is upright again once seated; the other way about to rise.
+        # people bow before the pelvis moves back, and are upright again once seated; the reverse to rise
         for moment in (down - 0.1, up - 0.35):
             bowed += _during(t, moment, moment + 1.15 * take, 0.55 * take)
     intent.shift = seated[:, None] * np.array([back, 0.0, 0.0])
-    # The seat is met with the knees already bent: down lags behind back.
+    # knees are already bent when the seat is touched: the downward motion lags behind the backward one
     intent.shift[:, 2] = drop * np.maximum(seated, 0.0) ** 1.15
     intent.tilt = np.radians(22.0) * bowed - np.radians(6.0) * seated
     intent.torso[:, 1] = np.radians(24.0) * bowed + np.radians(4.0) * seated

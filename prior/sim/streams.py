@@ -1,4 +1,4 @@
-"""The recordings of ``sim_data/``, made from a manifest: script, camera, noise and seed of each."""
+"""Generates the recordings of ``sim_data/`` from a manifest with the script, camera, noise and seed of each."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.prior.timing.resample import PERIOD_NS
 
 START_NS = 1_750_000_000_000_000_000
-"""Stamp of a stream's second 0: any moment will do, as long as it is the same every time."""
+"""Stamp of a stream's second 0, nanoseconds; arbitrary, but always the same."""
 
 _SHORTEST_S = 2.0
 
 
 class ManifestError(ValueError):
-    """A manifest that cannot be followed. The text says where and why."""
+    """A manifest is invalid; the message says where and why."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """How to make one stream.
+    """The recipe of one stream.
 
     Attributes:
-        name: of the stream and its directory.
-        what: one line for a person.
+        name: name of the stream and its directory.
+        what: description in one line.
         script: a key of `prior.sim.scripts.SCRIPTS`.
-        seed: of everything random: body, motion, noise.
-        camera: how it is filmed.
+        seed: random seed of body, motion and noise.
+        camera: the camera.
         noise: file with the noise's parameters.
-        seconds: the first so many are kept; the whole script if None.
+        seconds: duration that is kept; the whole script if None.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Stream:
 
 
 def read_manifest(path: Path) -> dict[str, Stream]:
-    """The streams of a manifest by name.
+    """Read the streams of a manifest, by name.
 
     Raises:
         ManifestError: the file is missing, is not JSON, or an entry has an unknown key, script or value.
@@ -102,13 +102,13 @@ def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:
 
 
 def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
-    """Simulate and film a stream: frames for ``pose/raw`` and ``pose/truth``.
+    """Simulate a stream; returns the frames of ``pose/raw`` and ``pose/truth``.
 
-    The truth is on the 30 Hz grid that starts at the first raw frame, as the prior's output is. A joint's state says
-    whether the camera had it in view with a free line of sight (SEEN) or not (IMPUTED).
+    The truth is on the 30 Hz grid that starts at the first raw frame, like the prior's output. A joint's state is SEEN
+    if the camera has it in view with a free line of sight, otherwise IMPUTED.
 
     Raises:
-        ManifestError: the file of the noise's parameters is missing, or is none.
+        ManifestError: the file of the noise's parameters is missing or invalid.
     """
     try:
         noise = NoiseModel.load(stream.noise)
@@ -123,10 +123,10 @@ def make(stream: Stream) -> tuple[list[PoseRaw], list[PoseWorld]]:
 
 
 def record(stream: Stream, directory: Path) -> None:
-    """Make a stream and record it to ``directory``.
+    """Simulate a stream and record it to ``directory``.
 
     Raises:
-        RecordingError: the directory is there already, or cannot be made.
+        RecordingError: the directory exists already, or cannot be created.
     """
     raw, truth = make(stream)
     with RecordingWriter(directory) as recording:
@@ -176,7 +176,7 @@ def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) ->
 
 
 def _seen(person: Motion, people: list[Motion], camera: Camera) -> NDArray[np.bool_]:
-    """(T, 22) whether a joint is in view and nothing hides it."""
+    """(T, 22) whether each joint is in view and not hidden."""
     eye = np.array(camera.position)
     hidden = as_tracked(sight(person.positions, people, eye).hidden, mount("smpl22"))
     return (hidden < 0.5) & camera.in_view((person.positions - eye) @ camera.orientation)

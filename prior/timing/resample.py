@@ -23,8 +23,7 @@ MAX_GAP_NS = 150_000_000
 LOOK_AHEAD_NS = 10_000_000
 """Largest age of a frame at which it is extrapolated to the grid time without waiting for the next one, nanoseconds."""
 LOOK_AHEAD_PERIODS = 0.35
-"""The same limit for fast streams, periods of the stream. Extrapolating a whole period multiplies noise variance by
-5."""
+"""The same limit for fast streams, periods. Extrapolation by a whole period multiplies the noise variance by 5."""
 PERIOD_GAIN = 0.1
 """Weight of the newest period in the running mean of a stream's periods."""
 
