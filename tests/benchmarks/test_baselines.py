@@ -18,7 +18,7 @@ from steadypose.benchmarks.baselines.filters import (
     one_euro,
 )
 from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
-from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
 STAMPS = np.arange(40) / 30.0
@@ -29,15 +29,6 @@ def motion(rng: np.random.Generator, frames: int = 40, joints: int = 2) -> np.nd
     """(T, 3, J, 3) joints of three clips that move smoothly, with 1 cm of noise."""
     start, speed = rng.normal(size=(2, 3, joints, 3))
     return start + speed * STAMPS[:frames, None, None, None] + rng.normal(0, 0.01, (frames, 3, joints, 3))
-
-
-def rest_pose() -> np.ndarray:
-    """(22, 3) metres."""
-    placed = REST_OFFSETS.copy()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            placed[joint] += placed[parent]
-    return placed
 
 
 def line(values: list[float]) -> np.ndarray:
@@ -159,11 +150,10 @@ def test_the_bank_finds_the_noise() -> None:
 
 
 def test_a_hidden_joint_stays_beside_the_nearest_seen_one_and_turns_with_the_trunk() -> None:
-    rest = rest_pose()
     angle = np.linspace(0.0, 1.5, 40)
     cosine, sine, zero, one = np.cos(angle), np.sin(angle), np.zeros(40), np.ones(40)
     turn = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one], axis=-1).reshape(40, 3, 3)
-    truth = np.einsum("tab,jb->tja", turn, rest)[:, None] + STAMPS[:, None, None, None] * (1.0, 0.5, 0.0)
+    truth = np.einsum("tab,jb->tja", turn, REST_POSITIONS)[:, None] + STAMPS[:, None, None, None] * (1.0, 0.5, 0.0)
     seen = truth.copy()
     seen[10:, 0, [J["left_knee"], J["left_ankle"], J["left_foot"], J["right_wrist"]]] = np.nan
     np.testing.assert_allclose(beside(seen, STAMPS, 0), truth, atol=1e-9)

@@ -12,17 +12,14 @@ from steadypose.benchmarks.corruption import (
     spiked,
     swapped,
 )
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
 
 SHAPE = (300, 6, 22, 3)
 
 
 def resting() -> np.ndarray:
     """(1, 1, 22, 3) a body in a T-pose that faces +x, 0.95 m up."""
-    body = REST_OFFSETS.copy()
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        body[joint] += body[parent]
-    return (body + [0.0, 0.0, 0.95])[None, None]
+    return (REST_POSITIONS + [0.0, 0.0, 0.95])[None, None]
 
 
 def test_noise_has_the_size_and_the_memory_that_it_says() -> None:

@@ -1,5 +1,4 @@
 import importlib
-import io
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, machine, measured, ships, stale
 from steadypose.benchmarks.report import Args, fill, main, page
-from steadypose.benchmarks.results import Study, Table, load, save, show
+from steadypose.benchmarks.results import Study, Table, load, save
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
@@ -168,12 +166,3 @@ def test_the_machine_is_described() -> None:
     assert int(found["cores"]) >= 1
     assert float(found["memory_gb"]) > 0
     assert set(found) >= {"load_1min", "python", "torch", "commit", "date"}
-
-
-def test_show_prints_every_cell() -> None:
-    console = Console(width=100, file=io.StringIO())
-    with console.capture() as capture:
-        show(TABLE, console)
-    text = capture.get()
-    assert all(cell in text for row in TABLE.rows for cell in row)
-    assert "A note." in text

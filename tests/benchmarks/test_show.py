@@ -29,6 +29,7 @@ def test_no_figure_is_broken(table: Table) -> None:
     assert max(map(len, lines)) <= 80
     for cell in {cell for row in table.rows for cell in row[1:]}:
         assert any(cell in line for line in lines), cell
+    assert " ".join(table.note.split()) in " ".join(" ".join(lines).split())
 
 
 def test_a_group_of_methods_is_named_once() -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from steadypose.prior.body.inverse_kinematics import solve_rotations
+from steadypose.prior.body.kinematics import quaternions
 from steadypose.prior.body.skeleton import REST_OFFSETS
 
 
@@ -14,19 +16,15 @@ def write_motion(
     path: Path,
     clips: Sequence[np.ndarray],
     split: Sequence[str],
-    root_rotations: np.ndarray | None = None,
     flat: Sequence[bool] | None = None,
 ) -> Path:
-    """Clips (T, 22, 3) metres, z up, of the rest skeleton, with root rotations (N, 4) xyzw; returns ``path``."""
+    """Clips (T, 22, 3) metres, z up, of the rest skeleton; returns ``path``."""
     positions = np.concatenate(clips).astype(np.float32)
-    rotations = np.tile(np.array([0, 0, 0, 1], dtype=np.float32), (len(positions), 22, 1))
-    if root_rotations is not None:
-        rotations[:, 0] = root_rotations
     same = {"set": "default", "subject": "somebody", "source": "synthetic", "action": "moving"}
     np.savez(
         path,
         positions=positions,
-        rotations=rotations,
+        rotations=quaternions(solve_rotations(positions, REST_OFFSETS)).astype(np.float32),
         offsets=np.repeat(REST_OFFSETS[None], len(clips), axis=0).astype(np.float32),
         contacts=np.zeros((len(positions), 8), dtype=bool),
         clip_start=np.cumsum([0, *map(len, clips)]),

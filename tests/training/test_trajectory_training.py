@@ -32,10 +32,8 @@ def prepared(tmp_path: Path) -> Path:
         pose[:, [5, 8, 11], 0] -= swing[:, None]
         pose[..., 0] += speed * t[:, None]
         clips.append(pose @ yaw_matrix(rng.uniform(-3, 3)).T)
-    yaws = [np.arctan2(*(c[0, 1] - c[0, 2])[[0, 1]] * [-1, 1]) for c in clips]
-    roots = [[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)] for yaw in yaws]
     split, flat = ["train"] * 4 + ["val"] * 2, [True, True, True, False, True, True]
-    return write_motion(tmp_path / "prepared.npz", clips, split, np.repeat(roots, count, axis=0), flat)
+    return write_motion(tmp_path / "prepared.npz", clips, split, flat)
 
 
 def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):

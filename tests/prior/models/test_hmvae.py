@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import waving
+from tests.helpers.prepared import write_motion
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS
@@ -109,23 +110,9 @@ def test_heading_is_removed_and_given_back() -> None:
 
 
 def prepared(path: Path, clips: int = 4) -> Path:
-    """A file in the layout of `steadypose prepare`, of synthetic motion."""
-    positions = np.concatenate([waving(80, speed=1 + 0.1 * k) for k in range(clips)])
-    rotations = solve_rotations(positions, REST_OFFSETS)
-    np.savez(
-        path,
-        positions=positions.astype(np.float32),
-        rotations=Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(-1, 22, 4).astype(np.float32),
-        offsets=np.tile(REST_OFFSETS, (clips, 1, 1)).astype(np.float32),
-        contacts=np.zeros((80 * clips, 8), dtype=bool),
-        clip_start=np.arange(clips + 1) * 80,
-        split=np.array(["train"] * (clips - 1) + ["val"]),
-        set=np.array(["default"] * clips),
-        subject=np.array([f"person {k}" for k in range(clips)]),
-        source=np.array(["synthetic"] * clips),
-        action=np.array(["waving"] * clips),
-    )
-    return path
+    """A file in the layout of `steadypose prepare`, of people who wave."""
+    waved = [waving(80, speed=1 + 0.1 * k) for k in range(clips)]
+    return write_motion(path, waved, ["train"] * (clips - 1) + ["val"])
 
 
 def test_sampled_windows_stay_inside_their_clips(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from tests.training.data.test_motion_datasets import idle_bvh, pack, unpack
 from steadypose.nodes.commands.prepare import PrepareError, find_sources, prepare
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import CANONICAL
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.prepare import (
@@ -41,9 +41,7 @@ Array = NDArray[np.float64]
 
 def standing(frames: int, height: float = 0.0) -> Array:
     """The rest pose, its toes ``height`` above the floor's toe height."""
-    body = np.zeros((22, 3))
-    for joint, parent in enumerate(PARENTS[1:], start=1):
-        body[joint] = body[parent] + REST_OFFSETS[joint]
+    body = REST_POSITIONS.copy()
     body[:, 2] += height + TOE_HEIGHT - body[J["left_foot"], 2]
     return np.tile(body, (frames, 1, 1))
 
