@@ -345,7 +345,7 @@ def _decompressed(body: bytes, most: int) -> bytes | memoryview:
     if length != len(packed):
         raise ValueError("a chunk of another length than its record")
     if size > min(MAX_CHUNK, most) or size > max(RATIO_FROM, MAX_RATIO * len(packed)):
-        raise ValueError(f"a chunk of {len(packed)} bytes that becomes {size}")
+        raise ValueError(f"a chunk of {len(packed)} bytes that decompresses to {size}")
     data: bytes | memoryview = packed
     if name == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
@@ -354,7 +354,7 @@ def _decompressed(body: bytes, most: int) -> bytes | memoryview:
     elif name:
         raise ValueError(f"compression {name!r} is not known")
     if len(data) != size:
-        raise ValueError("a chunk that becomes of another size than it says")
+        raise ValueError("a chunk that decompresses to another size than it states")
     if checksum and zlib.crc32(data) != checksum:
-        raise ValueError("a chunk whose checksum does not hold")
+        raise ValueError("a chunk with a wrong checksum")
     return data

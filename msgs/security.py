@@ -302,5 +302,5 @@ def loopback_keys() -> Keys:
             return load_keys(folder)
         except (ValueError, OSError) as error:
             if time.monotonic() > deadline:
-                raise TransportError(f"{folder}: {error}; remove it, and others are made") from error
+                raise TransportError(f"{folder}: {error}; remove it, and new keys are made") from error
         time.sleep(0.01)

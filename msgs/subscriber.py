@@ -324,7 +324,7 @@ def _check(endpoint: str, keys: Keys | None, clear_text: bool) -> None:
     if keys is None and not clear_text and not is_local(endpoint):
         raise TransportError(
             f"{endpoint} is another machine: expected keys, got none; make them with `steadypose keys`, "
-            "or ask for clear text by name"
+            "or set clear_text"
         )
     if transport == "ipc" and not path.startswith("@"):
         check_private(Path(path).absolute().parent)

@@ -62,12 +62,12 @@ def broken(body: CleanBody | WorldBody) -> str | None:
     if not np.isfinite(body.positions[known]).all():
         return "a position is not finite though its state is known"
     if not (np.isfinite(body.sigma[known]).all() and (body.sigma[known] >= 0).all()):
-        return "a deviation is no number of 0 or more though its state is known"
+        return "a standard deviation is not a number of 0 or more though its state is known"
     if not are_unit(body.rotations).all():
         return "a rotation is not of norm 1"
     if isinstance(body, CleanBody):
         if not (np.isfinite(body.bone_lengths).all() and (body.bone_lengths >= 0).all()):
-            return "a bone's length is no number of 0 or more"
+            return "a bone's length is not a number of 0 or more"
         return None
     root = np.concatenate([body.root_position, body.root_velocity, body.covariance.ravel()])
     if not np.isfinite(root).all():

@@ -96,9 +96,9 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if (fast := float(np.nanmedian(speeds))) > FASTEST * height > 0:
         yield warning(
             "jumps",
-            f"a body goes at {fast:.0f} units a second, {fast / height:.0f} times its height: expected less than "
-            f"{FASTEST:.0f}; if an id goes from one person to another, --set prior.identify.enabled=true; if stamps "
-            "are those of arrival, take those of capture",
+            f"a body moves at {fast:.0f} units per second, {fast / height:.0f} times its height: expected less than "
+            f"{FASTEST:.0f}; if ids switch between people, --set prior.identify.enabled=true; if stamps are times of "
+            "arrival, use times of capture",
         )
 
 

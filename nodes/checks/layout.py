@@ -66,7 +66,7 @@ def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) ->
     elif same:
         hint = f"; {' and '.join(same)} have {count}"
     else:
-        hint = "; a joint that was not found is NaN, not left out"
+        hint = "; a joint that was not detected is NaN, not left out"
     return error(
         "wrong_joint_count", f"{skeleton.name}: expected bodies of {len(skeleton.joints)} joints, got {count}{hint}"
     )
@@ -179,7 +179,7 @@ def skeleton_hint(name: str, shape: Sequence[int]) -> str:
     return (
         nearest(plain, SKELETONS)
         or count_hint(shape)
-        or "; of joints of your own, give their layout (docs/library.md, docs/sources.md)"
+        or "; for joints of your own, give their layout (docs/library.md, docs/sources.md)"
     )
 
 
@@ -187,7 +187,7 @@ def axes_hint(shape: Sequence[int], skeleton: str) -> str:
     """A hint for positions whose shape does not fit the skeleton."""
     joints = len(SKELETONS[skeleton].joints)
     if len(shape) == 2 and shape == (joints, 3):
-        return "; of a single frame: positions[None], or steadypose.Filter for frame by frame"
+        return "; for a single frame: positions[None], or steadypose.Filter for frame by frame"
     if len(shape) == 2 and shape[-1] in (3 * joints, 2 * joints, 4 * joints):
         return (
             f"; a row of numbers a frame: positions.reshape(len(positions), {joints}, {shape[-1] // joints})[..., :3]"

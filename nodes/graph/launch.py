@@ -67,7 +67,7 @@ class Launch(_EveryLaunch):
         for node in self.nodes:
             if node not in NODES:
                 raise LaunchError(
-                    f"nodes names {node!r}, which is no node{nearest(node, NODES)}; there are {', '.join(NODES)}"
+                    f"nodes names {node!r}, which is not a node{nearest(node, NODES)}; there are {', '.join(NODES)}"
                 )
         if self.server.clients and "pose_input" in self.nodes:
             raise LaunchError("[server] clients have their own pose_input: expected nodes without it, such as prior")
@@ -178,7 +178,7 @@ def bundled(*parts: str) -> Path:
     """
     path = PACKAGE.joinpath(*parts)
     if not path.exists():
-        raise LaunchError(f"{path} does not exist, and should have come with steadypose: install it anew")
+        raise LaunchError(f"{path} does not exist, but is part of steadypose: reinstall it")
     return path
 
 

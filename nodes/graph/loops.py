@@ -107,7 +107,7 @@ def compile_missing(say: Callable[[str], None]) -> None:
         except OSError:
             say("waiting for another process that compiles the loops")
             if not _locked(lock, WAIT_S):
-                say(f"another process compiles the loops for more than {WAIT_S / 60:g} minutes: going on without")
+                say(f"another process has been compiling the loops for {WAIT_S / 60:g} minutes: not waiting any longer")
                 return
         if not loop_cache.is_complete():
             _compile(folder, say)

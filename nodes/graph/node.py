@@ -264,7 +264,7 @@ class Node(ABC):
         """Count a message that could not be processed, and log the first of its kind."""
         cause = f"refused.{type(error).__name__}"
         if cause not in self.health.counts:
-            logger.error("%s: a message of %s failed; more are only counted", self.name, topic, exc_info=error)
+            logger.error("%s: a message on %s failed; any more are only counted", self.name, topic, exc_info=error)
         self.health.counts[cause] += 1
 
     def publish(self, topic: str, message: Message, *, delay_ns: int = 0) -> bool:

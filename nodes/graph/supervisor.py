@@ -96,7 +96,7 @@ class Child:
         if (status := self._process.poll()) is not None:
             self._note_exit(status)
         elif self.silent_s > HUNG_S or (self._heard_ns is None and now - self._started_ns > STARTING_S * 1e9):
-            self._log(f"{self.name}: was not heard for {HUNG_S if self._heard_ns else STARTING_S:g} s; killing it")
+            self._log(f"{self.name}: sent no report for {HUNG_S if self._heard_ns else STARTING_S:g} s; killing it")
             self._process.kill()
             self._process.wait()
             self._note_exit(-signal.SIGKILL)

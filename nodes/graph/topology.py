@@ -223,7 +223,7 @@ class TransportSettings:
                 raise LaunchError(f"[transport.endpoints] {node}: expected an address, got {address!r}")
             if node not in NODES:
                 raise LaunchError(
-                    f"[transport.endpoints] names {node!r}, which is no node{nearest(node, NODES)}; "
+                    f"[transport.endpoints] names {node!r}, which is not a node{nearest(node, NODES)}; "
                     f"nodes are {', '.join(NODES)}"
                 )
         if not self.lifespan_s > 0:

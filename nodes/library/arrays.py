@@ -120,7 +120,7 @@ def source_of(
         stated["skeleton"] = np.array(skeleton_name(skeleton))
     if isinstance(positions, (str, os.PathLike)):
         if stated:
-            raise NpzError(f"{positions}: expected no {', '.join(stated)} beside a file, which says so itself")
+            raise NpzError(f"{positions}: expected no {', '.join(stated)} beside a file, which contains it")
         return open_recording(Path(positions))
     if fps is not None and stamp_ns is not None:
         raise NpzError("expected fps, of a regular stream, or stamp_ns, got both; leave fps out")
@@ -142,8 +142,8 @@ def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
         array = np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as error:
         raise NpzError(
-            f"{name}: expected numbers of one shape, got {type(value).__name__}, of which numpy says: {error}; frames "
-            "without a joint, or without a body, have NaN there, not fewer entries"
+            f"{name}: expected numbers of one shape, got {type(value).__name__} ({error}); frames without a "
+            "joint or a body have NaN there, not fewer entries"
         ) from error
     if array.dtype.kind == "O":
         raise NpzError(

@@ -79,4 +79,4 @@ def _compiled(kind: str) -> Any:
             if package == "steadypose_msgs"
             else f"sudo apt install ros-$ROS_DISTRO-{package.replace('_', '-')}"
         )
-        raise LaunchError(f"{kind} is not to be had from the ROS that is sourced: {how}") from error
+        raise LaunchError(f"{kind} is not available in the sourced ROS: {how}") from error

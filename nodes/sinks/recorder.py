@@ -215,9 +215,9 @@ class RecorderNode(Node):
         try:
             free = shutil.disk_usage(self._writer.directory).free
             if free < self._settings.free_mb * 1e6:
-                self._no_room(f"{free / 1e6:.0f} MB are free, {self._settings.free_mb:g} are to be left")
+                self._no_room(f"{free / 1e6:.0f} MB are free, less than free_mb = {self._settings.free_mb:g}")
             elif self._full:
-                logger.info("recorder: there is room again; going on in the next part")
+                logger.info("recorder: the disk has room again; the next part starts")
                 self._writer.split()
                 self._full = False
             elif self._settings.sync_s and now - self._synced_ns >= self._settings.sync_s * 1e9:

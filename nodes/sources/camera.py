@@ -107,7 +107,7 @@ class CameraSource(LiveSource):
             return []
         return [
             warning(
-                "camera", f"{self._state}; expected a camera that gives frames: `steadypose doctor` names those here"
+                "camera", f"{self._state}; expected a camera that gives frames; `steadypose doctor` lists the cameras"
             )
         ]
 

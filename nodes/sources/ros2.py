@@ -116,7 +116,7 @@ class TransformBuffer:
         if not first <= at_ns <= last:
             early = "older than the oldest" if at_ns < first else "newer than the newest"
             off = (first - at_ns if at_ns < first else at_ns - last) / 1e9
-            raise TransformError(f"the transform of {frame!r} is wanted for a moment {off:.3f} s {early} heard on /tf")
+            raise TransformError(f"the transform of {frame!r} is needed at a time {off:.3f} s {early} received on /tf")
         after = bisect_left(moments, at_ns, key=_stamp)
         b = moments[after]
         if b[0] == at_ns:
@@ -302,7 +302,7 @@ class Ros2Source(LiveSource):
             return [
                 warning(
                     "ros_silent",
-                    f"nothing has come on {self._settings.topic}: expected a {TYPES[self._settings.type]}; see `ros2 "
+                    f"no message on {self._settings.topic} yet: expected a {TYPES[self._settings.type]}; check `ros2 "
                     "topic list -t`, and that ROS_DOMAIN_ID is the same there and here",
                 )
             ]

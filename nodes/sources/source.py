@@ -170,5 +170,5 @@ def count_failure(counts: Counter[str], camera: str, error: Exception) -> None:
     """Count a camera's frame that could not be processed, and log the first of its kind."""
     cause = f"frame: {type(error).__name__}"
     if cause not in counts:
-        logger.error("%s: a frame failed; more are only counted", camera, exc_info=error)
+        logger.error("%s: a frame failed; any more are only counted", camera, exc_info=error)
     counts[cause] += 1

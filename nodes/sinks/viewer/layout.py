@@ -45,8 +45,8 @@ RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED
 LEGEND = """
 - **blue** left, **orange** right
 - **faint** not observed: inferred; the sphere is its standard deviation
-- **points** of raw: the whiter, the surer
-- **yellow** contact; **arrow** velocity, 1 m/s is 1 m; **grey** the truth
+- **points** of raw: whiter is more confident
+- **yellow** contact; **arrow** velocity, 1 m/s is 1 m; **grey** ground truth
 - **grid, axes** 0.5 m: x red, y green, z blue
 - **red** flagged as an anomaly
 """

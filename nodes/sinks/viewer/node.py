@@ -59,7 +59,7 @@ class ViewerNode(Node):
             self._view = PoseView(recording, flagged_from(self.launch))
             print(f"viewer: {self._server.url}", flush=True)
             if settings.host not in LOCAL_NAMES:
-                print(f"viewer: who listens on the network of {settings.host} sees the people here", flush=True)
+                print(f"viewer: anyone who listens on the network of {settings.host} can see the people", flush=True)
             try:
                 super().run()
             finally:

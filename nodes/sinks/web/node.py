@@ -61,7 +61,7 @@ class WebSettings:
         if self.token and (len(self.token) < 16 or not all(c.isalnum() or c in "-_" for c in self.token)):
             raise LaunchError(
                 f"[web] token: expected 16 or more letters, digits, - and _, got {len(self.token)} characters; "
-                "leave it out, and one is made"
+                "leave it out for a random one"
             )
 
 
@@ -94,7 +94,7 @@ class WebNode(Node):
         try:
             print(f"web: {self.url}", flush=True)
             if s.host not in LOCAL_NAMES:
-                print(f"web: whoever listens on the network to {s.host} can read the poses and the token", flush=True)
+                print(f"web: anyone who listens on the network to {s.host} can read poses and token", flush=True)
             super().work()
         finally:
             self._server.close()
