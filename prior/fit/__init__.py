@@ -1,1 +1,1 @@
-"""What takes a whole recording at once: test-time optimisation (HuMoR, section 4), which needs torch; completion."""
+"""Test-time optimisation of whole recordings (HuMoR, section 4), which needs torch."""

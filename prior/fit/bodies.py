@@ -24,34 +24,35 @@ from steadypose.prior.timing.rate import FPS
 
 FRAME_NS = 1e9 / FPS
 MIN_SIGMA = 0.01
-"""Metres: no sensor means the joints that our bones end in to less."""
+"""Least standard deviation of an observed joint, metres; sensors' joint definitions differ from ours by this much."""
 
 FAR = 0.1
-"""Metres, and five times the noise: what ``pose/clean`` has moved farther was another limb's, or no joint at all."""
+"""Largest distance, plus five times the noise, between an observed joint and ``pose/clean``, metres. An observation
+farther away is an outlier: another limb, or no joint."""
 
 LOWEST = 5.0
-"""Per cent of frames in which the lower foot is taken to stand on the floor, where the floor is not known."""
+"""Share of the frames in which the lower foot is assumed to stand on the floor, if the floor is unknown, per cent."""
 
 WORSE, WORSE_M = 2.0, 0.02
-"""A fit whose median misfit is larger than so many times that of ``pose/clean``, and by so many metres more, has
-failed."""
+"""Ratio to the median misfit of ``pose/clean``, and difference from it in metres, above which a fit has failed."""
 
 ELSEWHERE, ELSEWHERE_SHARE, STILL = 0.1, 0.4, 0.3
-"""Metres above or below the floor at which the lower foot stands in a share of the frames in which it is slower than
-so many m/s: on stairs or a chair. The model of motion knows but one floor, and would pull feet there."""
+"""Thresholds for a body on stairs or a chair: distance of the lower foot from the floor, metres; least share of the
+frames with that distance among those in which the foot is slow; and largest speed of a slow foot, m/s. The motion model
+has only one floor, and would pull feet to it."""
 
 _MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
-"""Of the median length of a normal vector in space, and of the deviation of third differences of white noise."""
+"""Median length of a standard normal 3D vector, and standard deviation of third differences of unit white noise."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One body for as long as it was seen without a gap, at 30 Hz.
+    """One body while it is present without a gap, at 30 Hz.
 
     Attributes:
-        id: of the body.
-        clean: (T,) messages, of which it is a part.
-        bodies: (T,) what ``pose/clean`` says of it.
+        id: id of the body.
+        clean: (T,) messages that contain it.
+        bodies: (T,) the body in ``pose/clean``.
         calibrated: whether the world's floor is at 0.
     """
 
@@ -66,7 +67,7 @@ class Seen:
         return np.array([message.stamp_ns for message in self.clean])
 
     def in_world(self, name: str) -> Floats:
-        """(T, 22, 3) metres: positions or raw positions, z up."""
+        """(T, 22, 3) metres, positions or raw positions in the world, z up."""
         return np.stack([
             SensorFrame.of(message.sensor_pose).to_world(np.asarray(getattr(body, name), dtype=np.float64))
             for message, body in zip(self.clean, self.bodies, strict=True)
@@ -75,12 +76,12 @@ class Seen:
 
 @dataclass(frozen=True)
 class Fit:
-    """What came of a body.
+    """The fit of a body.
 
     Attributes:
-        seen: of which.
-        track: the fit; None where it failed and ``pose/clean`` stays.
-        misfit: (T, 22) metres or pixels that stay unexplained; NaN where a joint was not seen.
+        seen: the body.
+        track: the fit; None if it failed, so that ``pose/clean`` stays.
+        misfit: (T, 22) remaining distance from the observations, metres or pixels; NaN where a joint is unobserved.
     """
 
     seen: Seen
@@ -89,7 +90,7 @@ class Fit:
 
 
 def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[Seen]:
-    """Every body of a cleaned stream, for as long as it was there whole and without a gap, so many frames at least."""
+    """Return every body of a cleaned stream, divided at gaps, if it is complete for at least ``least`` frames."""
     found: list[Seen] = []
     of_body: dict[int, list[tuple[PoseClean, CleanBody]]] = {}
     for _, message in messages:
@@ -108,11 +109,11 @@ def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[See
 
 
 def track_of(seen: Seen, points: Floats | None) -> Track:
-    """What is to be fitted of a body, from where ``pose/clean`` left it.
+    """Build the track to fit of a body, starting from ``pose/clean``.
 
     Args:
         seen: the body.
-        points: (T, N, 3) metres, world, of its surface, NaN where there are fewer; None where there are none.
+        points: (T, N, 3) metres, world, points of its surface, padded with NaN; None if there are none.
     """
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     offsets = estimate_offsets(positions)
@@ -131,14 +132,14 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
 
 
 def lowest_floor(positions: Floats) -> float:
-    """Metres: where the floor lies if the lower foot stands on it in the lowest few frames of (T, 22, 3)."""
+    """Return the floor's height, metres, if the lower foot of (T, 22, 3) stands on it in the lowest few frames."""
     feet = [J[f"{side}_foot"] for side in ("left", "right")]
     rest = REST_HEIGHT[4]
     return float(np.percentile(positions[:, feet, 2].min(axis=1), LOWEST) - rest)
 
 
 def stands_elsewhere(positions: Floats, floor: float) -> bool:
-    """Whether feet of (T, 22, 3) metres stand on more than a floor at this height, metres."""
+    """Whether feet of (T, 22, 3) metres also stand elsewhere than on a floor at this height, metres."""
     feet = [J[f"{side}_{part}"] for part in ("ankle", "foot") for side in ("left", "right")]
     heights = positions[:, feet, 2] - floor - np.array(REST_HEIGHT)[2:6]
     speed = np.linalg.norm(np.gradient(positions[:, feet], 1e-9 * FRAME_NS, axis=0), axis=-1)
@@ -148,7 +149,7 @@ def stands_elsewhere(positions: Floats, floor: float) -> bool:
 
 
 def noise_of(raw: Floats) -> float:
-    """Metres along an axis, of joints (T, 22, 3), by third differences, which motion hardly has."""
+    """Estimate the noise of joints (T, 22, 3), metres along an axis, from third differences: motion has hardly any."""
     third = np.linalg.norm(np.diff(raw, n=3, axis=0), axis=-1)
     third = third[np.isfinite(third)]
     return max(float(np.median(third)) / _MEDIAN_NORM / float(_THIRD), MIN_SIGMA) if len(third) else MIN_SIGMA
@@ -162,7 +163,7 @@ def fit_body(
     folder: Path | None,
     advanced: Callable[[], None] = lambda: None,
 ) -> Fit:
-    """Fit one body; where that fails, or it stands elsewhere, ``pose/clean`` stays, and its anomaly is flagged."""
+    """Fit one body. If this fails, or the body stands elsewhere, ``pose/clean`` stays and its anomaly is flagged."""
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     before = np.linalg.norm(positions - raw, axis=-1)
     if stands_elsewhere(positions, 0.0 if seen.calibrated else lowest_floor(positions)):
@@ -185,14 +186,14 @@ def fit_stream(
     began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
     advanced: Callable[[], None] = lambda: None,
 ) -> list[Fit]:
-    """Fit every body of a cleaned stream that is seen for long enough.
+    """Fit every body of a cleaned stream that is present for long enough.
 
     Args:
-        messages: of the stream, ``pose/raw`` among them.
-        surface: (T, N, 3) metres, a row for each frame of ``pose/raw``: points of the body's surface in the sensor's
-            frame, NaN where there are fewer; None where there are none.
-        model: of transitions.
-        folder: for finished windows, so that the same call goes on where it was stopped.
+        messages: messages of the stream, including ``pose/raw``.
+        surface: (T, N, 3) metres, points of the body's surface in the sensor's frame for each frame of ``pose/raw``,
+            padded with NaN; None if there are none.
+        model: the transition model.
+        folder: cache of finished windows, so that an interrupted call can resume.
         began: called with the bodies.
         advanced: called after each window.
     """
@@ -217,7 +218,7 @@ def fit_stream(
 
 
 def rewritten(messages: Sequence[tuple[str, Message]], fits: Sequence[Fit]) -> list[tuple[str, Message]]:
-    """The messages of a cleaned stream, with poses replaced by the fitted ones."""
+    """Return the messages of a cleaned stream with fitted poses."""
     clean: dict[tuple[int, int], CleanBody] = {}
     world: dict[tuple[int, int], tuple[Fit, int]] = {}
     planes: dict[int, Floats] = {}
@@ -246,7 +247,7 @@ def rewritten(messages: Sequence[tuple[str, Message]], fits: Sequence[Fit]) -> l
 
 
 def ground_plane(ground: Floats) -> Floats:
-    """(4,) as in `PoseWorld`, of a height and two tilts."""
+    """(4,) ground plane, as in `PoseWorld`, from a height and two tilts."""
     from scipy.spatial.transform import Rotation
 
     normal = Rotation.from_rotvec([ground[1], ground[2], 0.0]).as_matrix()[:, 2]

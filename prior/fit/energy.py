@@ -1,8 +1,8 @@
-"""The energy of a motion: a sum of terms with normalised residuals, most of them under a robust kernel.
+"""The energy of a motion: a sum of terms with normalised residuals, most of them with a robust kernel.
 
-A term has residuals of any shape in units of their standard deviation; its energy is half the sum of their squares,
-each through the kernel. That is HuMoR's energy (section 4.2, appendix C), its weights written as the standard
-deviations that they stand for, and the form that a Gauss-Newton solver takes too.
+A term has residuals of any shape in units of their standard deviations. Its energy is half the sum of the kernel of
+their squares. This is HuMoR's energy (section 4.2, appendix C) with weights written as standard deviations. A
+Gauss-Newton solver can use the same form.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from steadypose.prior.timing.rate import FPS
 
 _CONTACTS = list(CONTACT_JOINTS)
 _FEET = slice(2, 6)
-"""of `CONTACT_JOINTS`, heels and toes"""
+"""Heels and toes among `CONTACT_JOINTS`."""
 
 
 class Term(Protocol):
-    """A part of the energy."""
+    """A term of the energy."""
 
     def residual(self, motion: Motion) -> Tensor:
-        """In standard deviations, of any shape; NaN nowhere."""
+        """Residuals in standard deviations, of any shape, without NaN."""
         ...
 
     def kernel(self, square: Tensor) -> Tensor:
-        """The cost of squared residuals, of their shape."""
+        """Cost of squared residuals, of the same shape."""
         ...
 
 
 class Quadratic:
-    """A term without a robust kernel: its residuals are taken to be normal."""
+    """A term without a robust kernel, for normally distributed residuals."""
 
     def kernel(self, square: Tensor) -> Tensor:
         return square
 
 
 def energy(motion: Motion, terms: Sequence[Term]) -> Tensor:
-    """The sum of all terms, a scalar in nats but for a constant."""
+    """Return the sum of all terms: a scalar in nats, up to a constant."""
     return torch.stack([0.5 * term.kernel(term.residual(motion).square()).sum() for term in terms]).sum()
 
 
 def huber(square: Tensor, scale: float) -> Tensor:
-    """Quadratic up to ``scale`` standard deviations, linear beyond: no residual loses its pull (Huber 1964)."""
+    """Quadratic up to ``scale`` standard deviations, linear beyond, so that no residual is ignored (Huber 1964)."""
     return torch.where(square <= scale**2, square, 2.0 * scale * square.clamp(min=scale**2).sqrt() - scale**2)
 
 
 def geman_mcclure(square: Tensor, scale: float) -> Tensor:
-    """Quadratic near 0; beyond ``scale`` standard deviations it levels off (Geman and McClure 1987)."""
+    """Quadratic near 0, levelling off beyond ``scale`` standard deviations (Geman and McClure 1987)."""
     return square / (1.0 + square / scale**2)
 
 
@@ -66,12 +66,12 @@ def bisquare(square: Tensor, scale: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Transitions(Quadratic):
-    """E_CVAE, and the defect of each step: how far its next state is from the decoder's.
+    """E_CVAE, and the defect of each step: the difference of its next state from the decoder's.
 
     Attributes:
-        joints_sigma: metres, the decoder's own error of a step.
-        rotations_sigma: the same of the entries of rotation matrices.
-        latent_sigma: standard deviations of the prior; 1 is the prior itself, more a wider one.
+        joints_sigma: metres, the decoder's error of joints in a step.
+        rotations_sigma: the decoder's error of entries of rotation matrices.
+        latent_sigma: scale of the prior's standard deviation: 1 is the prior, more is wider.
     """
 
     joints_sigma: float = 0.008
@@ -91,12 +91,12 @@ class Transitions(Quadratic):
 
 @dataclass(frozen=True)
 class FirstState(Quadratic):
-    """E_init, by the likeliest component of the mixture (a max-mixture, Olson and Agarwal 2013).
+    """E_init, by the most likely component of the mixture (max-mixture, Olson and Agarwal 2013).
 
     Attributes:
-        sigma: standard deviations of the mixture; 1 is the mixture itself, more a wider one.
-        all_states: whether it holds for all states, not the first alone: a prior of poses, where there is none of
-            motion.
+        sigma: scale of the mixture's standard deviations: 1 is the mixture, more is wider.
+        all_states: whether it applies to all states and not only the first: a pose prior for stages without a motion
+            prior.
     """
 
     sigma: float = 1.0
@@ -113,7 +113,7 @@ class FirstState(Quadratic):
 
 @dataclass(frozen=True)
 class Smooth(Quadratic):
-    """E_smooth, of the joints' accelerations: a prior of motion that knows no bodies.
+    """E_smooth, of the joints' accelerations: a motion prior without knowledge of bodies.
 
     Attributes:
         sigma: m/s² along an axis.
@@ -127,7 +127,7 @@ class Smooth(Quadratic):
 
 @dataclass(frozen=True)
 class Bones(Quadratic):
-    """E_shape: bones stay about as they were initially.
+    """E_shape: bones stay near their initial values.
 
     Attributes:
         sigma: metres along an axis.
@@ -141,12 +141,12 @@ class Bones(Quadratic):
 
 @dataclass(frozen=True)
 class Ground(Quadratic):
-    """E_gnd: a normal prior of the ground, level and at a height.
+    """E_gnd: a normal prior of the ground's height and tilt.
 
     Attributes:
-        height: metres, world, its mean.
-        height_sigma: metres.
-        tilt_sigma: radians.
+        height: metres, world, mean height.
+        height_sigma: metres, standard deviation of the height.
+        tilt_sigma: radians, standard deviation of the tilt.
     """
 
     height: float
@@ -160,13 +160,13 @@ class Ground(Quadratic):
 
 @dataclass(frozen=True)
 class Standing(Quadratic):
-    """E_env: joints in contact do not move and are at their height of contact; no foot is below the ground.
+    """E_env: joints in contact do not move and are at their contact height; no foot is below the ground.
 
-    The decoder's contact probabilities weigh this, detached: else it were cheapest to have no contacts.
+    The decoder's contact probabilities weigh the term, detached. Otherwise, having no contacts would be cheapest.
 
     Attributes:
-        speed_sigma: m/s along an axis, of a joint in contact.
-        height_sigma: metres beyond `CONTACT_HEIGHT`, and below the ground.
+        speed_sigma: m/s along an axis, standard deviation of the velocity of a joint in contact.
+        height_sigma: metres, standard deviation of heights beyond `CONTACT_HEIGHT` and below the ground.
     """
 
     speed_sigma: float = 0.1
@@ -186,7 +186,7 @@ class Standing(Quadratic):
 
 @dataclass(frozen=True)
 class Anchored(Quadratic):
-    """The first F frames are about where the window before left them.
+    """The first F frames stay near the result of the window before.
 
     Attributes:
         joints: (F, 22, 3) metres, world.

@@ -1,11 +1,11 @@
 """HM-VAE: a hierarchical motion VAE over windows of local rotations (Li et al., "Task-Generic Hierarchical Human
 Motion Prior using VAEs", 3DV 2021), sections 3.1 and 3.2, and its layers over the edges of a skeleton.
 
-Four building blocks (skeleton convolution, pooling, LeakyReLU) encode a window; the features after the first give
-the local latent z_l, those after the last the global latent z_g, one of each for every edge at that level. The
-decoder mirrors the encoder and takes z_l in before its last block. Layer plan, kernels and strides follow the
-official code for windows of 8 (and 64) frames; the pooling comes from our 22-joint graph. Features are (B, E * C, T):
-all channels of the first edge, then of the second, and so on, over time.
+Four building blocks (skeleton convolution, pooling, LeakyReLU) encode a window. The features after the first block give
+the local latent z_l, those after the last block the global latent z_g, one for every edge at that level. The decoder
+mirrors the encoder and receives z_l before its last block. Layers, kernels and strides follow the official code for
+windows of 8 (and 64) frames; the pooling is derived from our 22-joint graph. Features are (B, E * C, T): all channels
+of the first edge, then of the second, and so on, over time.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from steadypose.prior.models.layers import SLOPE, pool_matrix, pooling_levels, u
 
 
 class SkeletonConv(nn.Module):
-    """Temporal convolution in which an edge sees only its neighbours: a dense convolution under a mask.
+    """Temporal convolution over an edge's neighbours: a dense convolution with a mask.
 
-    The paper's equation averages over the neighbours; like the official code this sums, the scale being learned.
+    The paper's equation averages over the neighbours. Like the official code, this sums, as the scale is learned.
 
     Args:
-        in_channels: channels an edge coming in.
-        out_channels: channels an edge going out.
-        neighbours: for each edge the edges that it sees.
+        in_channels: input channels per edge.
+        out_channels: output channels per edge.
+        neighbours: for each edge, the edges that it reads.
         kernel: odd number of time steps.
         stride: step in time.
         bias: whether to add one.
@@ -65,17 +65,17 @@ class SkeletonConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, E * in, T) to (B, E * out, ceil(T / stride))."""
-        # Masked weights start at zero and the mask stops their gradient, so they stay zero: once trained, the
-        # live path need not multiply.
+        # Masked weights start at zero and the mask stops their gradient, so they stay zero. In evaluation, the product
+        # is not needed.
         weight = self.weight * self.mask if self.training else self.weight
         x = F.pad(x, (self.pad, self.pad), mode="reflect")
-        # One product over unfolded windows: at these lengths half the time of torch's convolution on a CPU.
+        # One product over unfolded windows takes half the time of torch's convolution on a CPU at these lengths.
         windows = x.unfold(2, weight.shape[2], self.stride).transpose(1, 2).flatten(2)
         return F.linear(windows, weight.flatten(1), self.bias).transpose(1, 2)
 
 
 class _EdgeMix(nn.Module):
-    """A fixed linear map between edges, the same for every channel."""
+    """A fixed linear map between edges, equal for all channels."""
 
     mix: Tensor
 
@@ -98,14 +98,14 @@ class SkeletonPool(_EdgeMix):
 
 
 class SkeletonUnpool(_EdgeMix):
-    """Each merged edge copied to the edges it came from: (B, len(groups) * C, T) to (B, E * C, T)."""
+    """Copy of each merged edge to its original edges: (B, len(groups) * C, T) to (B, E * C, T)."""
 
     def __init__(self, groups: Sequence[Sequence[int]]) -> None:
         super().__init__(torch.from_numpy(unpool_matrix(groups)))
 
 
 class EdgeLinear(nn.Module):
-    """One linear map from an edge's (C, T) features, flattened, to ``out`` values: shared by all edges."""
+    """A linear map from an edge's flattened (C, T) features to ``out`` values, shared by all edges."""
 
     def __init__(self, channels: int, time: int, out: int) -> None:
         super().__init__()

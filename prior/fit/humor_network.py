@@ -1,10 +1,10 @@
 """The transition model: a conditional VAE of the next state given this one (HuMoR, section 3, equations 1 to 4).
 
-Beside it its rollouts: motions from an initial state and latents, futures, and the latents of a motion.
+The module also has its rollouts: motions from an initial state and latents, futures, and the latents of a motion.
 
-Encoder and prior are Gaussians of a step's latent, the decoder takes a state and a latent to the next state. Unlike in
-the paper, joints and velocities follow from root, rotations and bones (`humor_state`), features are standardised,
-networks are half as wide, and contact has two labels, load and rest.
+Encoder and prior are Gaussians of a step's latent; the decoder maps a state and a latent to the next state. There are
+four differences from the paper: joints and velocities follow from root, rotations and bones (`humor_state`), features
+are standardised, networks are half as wide, and contacts have two labels, load and rest.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from steadypose.prior.fit.humor_state import (
 from steadypose.prior.fit.tensors import from_6d
 
 GROUPS = 16
-"""of the group normalisation"""
+"""Number of groups of the group normalisation."""
 
 STEP_SCALE = 0.02
-"""Metres and radians, unit of the decoder's output: about the standard deviation of the change in one frame."""
+"""Unit of the decoder's output, metres and radians: about the standard deviation of the change in one frame."""
 
 LOG_VARIANCES = (-10.0, 6.0)
-"""The official code bounds them not at all, and drops steps that are not numbers without a word."""
+"""Range of log-variances. The official code has no bounds, and silently drops steps with NaN."""
 
 POSE = 3 + 6 * JOINT_COUNT
-"""Outputs of a decoder of the next pose, not of its change: root, and two columns of each rotation."""
+"""Number of outputs of a decoder that predicts the next pose instead of the change: root, two columns per rotation."""
 
 
 @dataclass(frozen=True)
 class HumorConfig:
-    """Sizes, and what the ablations leave out.
+    """Sizes, and switches of the ablations.
 
     Attributes:
-        latent: numbers of a transition.
+        latent: dimensions of a transition's latent.
         hidden: width of the hidden layers.
-        learned_prior: whether the prior reads the state; else it is N(0, I), as in a Motion VAE.
-        residual: whether the decoder's output is the change of the state; else the next pose itself.
+        learned_prior: whether the prior depends on the state; if not, it is N(0, I), as in a Motion VAE.
+        residual: whether the decoder outputs the change of the state; if not, it outputs the next pose.
         contacts: whether it predicts contacts.
-        components: of the mixture of initial states.
+        components: number of components of the mixture of initial states.
     """
 
     latent: int = 48
@@ -66,13 +66,13 @@ class HumorConfig:
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HumorConfig:
-        """From the JSON of a weights file."""
+        """Build the configuration from the JSON of a weights file."""
         return cls(**config)
 
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Diagonal, of latents.
+    """A diagonal Gaussian of latents.
 
     Attributes:
         mean: (..., latent).
@@ -88,7 +88,7 @@ class Gaussian:
         return (0.5 * self.log_variance).exp()
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """One draw of each."""
+        """Draw a sample of each."""
         return self.mean + self.sigma * torch.randn(self.mean.shape, generator=generator)
 
     def kl(self, other: Gaussian) -> Tensor:
@@ -99,10 +99,10 @@ class Gaussian:
 
 
 class HumorNet(nn.Module):
-    """Prior, encoder and decoder, and the mixture of initial states beside them (`initial`).
+    """Prior, encoder and decoder, and the mixture of initial states (`initial`).
 
     Buffers:
-        mean, scale: (`FEATURES`,) what features are standardised by.
+        mean, scale: (`FEATURES`,) mean and scale that standardise features.
         mixture_log_weights (K,), mixture_means (K, 133), mixture_precisions (K, 133, 133): of standardised
             `pose_features`, the last the Cholesky factors of the inverse covariances.
     """
@@ -129,22 +129,22 @@ class HumorNet(nn.Module):
         self.register_buffer("mixture_precisions", torch.eye(known).expand(config.components, -1, -1).clone())
 
     def standardise(self, inputs: Tensor) -> Tensor:
-        """`features` (..., `FEATURES`) as the networks take them."""
+        """Standardise `features` (..., `FEATURES`) for the networks."""
         return (inputs - self.mean) / self.scale
 
     def prior_latent(self, inputs: Tensor) -> Gaussian:
-        """p(z | x), of standardised features (..., `FEATURES`) of states in their canonical frames."""
+        """p(z | x), from standardised features (..., `FEATURES`) of states in their canonical frames."""
         if self.prior is None:
             zero = inputs.new_zeros(*inputs.shape[:-1], self.config.latent)
             return Gaussian(zero, zero)
         return _gaussian(self.prior(inputs))
 
     def posterior_latent(self, inputs: Tensor, next_inputs: Tensor) -> Gaussian:
-        """q(z | x, x'), of the same and of the next states, as seen from the canonical frames of the first."""
+        """q(z | x, x'), from these features and those of the next states in the canonical frames of the first."""
         return _gaussian(self.encoder(torch.cat([inputs, next_inputs], dim=-1)))
 
     def decode(self, state: State, inputs: Tensor, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
-        """The next states, in the canonical frames of these, and logits of contacts (..., 16): load, then rest.
+        """Return the next states, in the canonical frames of these, and contact logits (..., 16): load, then rest.
 
         Args:
             state: (...) canonical.
@@ -162,14 +162,14 @@ class HumorNet(nn.Module):
         return posed(state, pose[..., :3], from_6d(pose[..., 3:].unflatten(-1, (JOINT_COUNT, 6))), offsets), logits
 
     def step(self, state: State, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
-        """The next states of any states (...) with these latents (..., latent), and logits of contacts (..., 16)."""
+        """Return the next states of any states (...) with latents (..., latent), and contact logits (..., 16)."""
         own = canonical(state, state)
         following, logits = self.decode(own, self.standardise(features(own)), latent, offsets)
         return placed(following, state), logits
 
 
 class Decoder(nn.Module):
-    """A perceptron that has the latent as an input of every layer, against posterior collapse."""
+    """A perceptron with the latent as an input of every layer, to prevent posterior collapse."""
 
     def __init__(self, widths: list[int], latent: int) -> None:
         super().__init__()
@@ -209,12 +209,12 @@ def _gaussian(output: Tensor) -> Gaussian:
 
 @dataclass(frozen=True)
 class Rollout:
-    """T steps on.
+    """T predicted steps.
 
     Attributes:
-        states: (..., T), without the initial one.
-        latents: (..., T, latent).
-        contacts: (..., T, 16) logits of load, then of rest; (..., T, 0) of a model without.
+        states: (..., T) states, without the initial one.
+        latents: (..., T, latent) latents of the steps.
+        contacts: (..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none.
     """
 
     states: State
@@ -223,10 +223,10 @@ class Rollout:
 
 
 def roll_out(model: HumorNet, initial: State, latents: Tensor, offsets: Tensor) -> Rollout:
-    """x_T = f(x_0, z_1..T), section 3.
+    """Compute x_T = f(x_0, z_1..T), section 3.
 
     Args:
-        model: trained.
+        model: trained model.
         initial: (...) states.
         latents: (..., T, latent).
         offsets: (..., 22, 3) metres, bones.
@@ -235,7 +235,7 @@ def roll_out(model: HumorNet, initial: State, latents: Tensor, offsets: Tensor) 
 
 
 def sample(model: HumorNet, initial: State, steps: int, offsets: Tensor, generator: torch.Generator | None) -> Rollout:
-    """A future: latents drawn from the prior at each state, or its means, the likeliest, if ``generator`` is None."""
+    """Predict a future, with latents drawn from the prior at each state, or its means if ``generator`` is None."""
     return _rolled(model, initial, offsets, [generator] * steps)
 
 
@@ -261,7 +261,7 @@ def _drawn(model: HumorNet, state: State, generator: torch.Generator | None) -> 
 
 
 def transitions(model: HumorNet, states: State) -> tuple[Gaussian, Gaussian]:
-    """Posterior and prior of the latents (..., T - 1) of the steps between states (..., T)."""
+    """Return posterior and prior of the latents (..., T - 1) of the steps between states (..., T)."""
     dim = states.root.dim() - 2
     index = (slice(None),) * dim
     before, after = states[(*index, slice(None, -1))], states[(*index, slice(1, None))]

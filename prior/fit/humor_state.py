@@ -1,8 +1,8 @@
 """The state of a moving body, and the canonical frame of each transition (HuMoR, section 3 and B.1).
 
-HuMoR's state holds SMPL's root, joint rotations and joints, and the velocities of all. Here joints are those that the
-rotations and this person's bones give, and velocities are differences to the step before, so that no two parts of a
-state can contradict each other and no term has to make them agree.
+HuMoR's state holds SMPL's root, joint rotations and joints, and their velocities. Here, joints follow from the
+rotations and the person's bones, and velocities are differences from the previous step. The parts of a state therefore
+cannot contradict each other, and no consistency term is needed.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ from steadypose.prior.timing.rate import FPS
 JOINT_COUNT = len(PARENTS)
 
 FEATURES = 3 + 6 * JOINT_COUNT + 3 * (JOINT_COUNT - 1) + 3 * JOINT_COUNT + 3
-"""Numbers of a state: root, rotations (6D), joints from the root, velocities of joints, and how fast the root turns."""
+"""Number of features of a state: root, 6D rotations, joints relative to the root, velocities, and the root's
+turning."""
 
 CHANGE = 3 + 3 * JOINT_COUNT
-"""Numbers of a step: how far the root moves, and rotation vectors of all joints."""
+"""Number of values of a step: displacement of the root, and rotation vectors of all joints."""
 
 _MIN_LEVEL = 1e-4
-"""Of the horizontal part of the body's left axis: one who lies exactly on a side faces nowhere."""
+"""Least horizontal component of the body's left axis; a body that lies exactly on its side has no heading."""
 
 
 @dataclass(frozen=True)
 class State:
-    """Of any number of bodies, z up, the floor at 0; leading dimensions (...) are alike.
+    """States of any number of bodies, z up, floor at 0, with equal leading dimensions (...).
 
     Attributes:
         root: (..., 3) metres, the pelvis.
         rotations: (..., 22, 3, 3) local; the root's is its orientation.
         joints: (..., 22, 3) metres.
-        velocity: (..., 22, 3) m/s of the joints, since the step before.
-        turning: (..., 3) rad/s, the rotation vector of the root since the step before.
+        velocity: (..., 22, 3) m/s, velocities of the joints since the previous step.
+        turning: (..., 3) rad/s, angular velocity of the root since the previous step.
     """
 
     root: Tensor
@@ -47,21 +48,21 @@ class State:
     turning: Tensor
 
     def __getitem__(self, at: object) -> State:
-        """Some of the bodies: indices of leading dimensions."""
+        """Select bodies by indices of the leading dimensions."""
         return State(*(getattr(self, field.name)[at] for field in fields(self)))
 
     def detach(self) -> State:
-        """Without gradients."""
+        """Return the states without gradients."""
         return State(*(getattr(self, field.name).detach() for field in fields(self)))
 
 
 def stack(states: list[State], dim: int) -> State:
-    """States of several times as one, along a new dimension."""
+    """Stack states of several times along a new dimension."""
     return State(*(torch.stack([getattr(s, field.name) for s in states], dim) for field in fields(State)))
 
 
 def choose(mask: Tensor, yes: State, no: State) -> State:
-    """Of each body (B,) the state ``yes`` (B, ...) where ``mask`` is true, else ``no``."""
+    """Select for each body (B,) the state ``yes`` (B, ...) where ``mask`` is true, otherwise ``no``."""
 
     def chosen(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(mask.reshape(-1, *[1] * (a.dim() - 1)), a, b)
@@ -70,12 +71,12 @@ def choose(mask: Tensor, yes: State, no: State) -> State:
 
 
 def states_of(root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
-    """The states (..., T - 1) of a motion from its second frame on: its first has no velocity.
+    """Return the states (..., T - 1) of a motion from its second frame on; the first has no velocity.
 
     Args:
         root: (..., T, 3) metres.
         rotations: (..., T, 22, 3, 3) local.
-        offsets: (..., 22, 3) metres, this person's bones, the same in all frames.
+        offsets: (..., 22, 3) metres, the person's bones, equal in all frames.
     """
     joints = forward_kinematics(rotations, offsets.unsqueeze(-3), root)[0]
     velocity = joints.diff(dim=-3) * FPS
@@ -86,10 +87,10 @@ def states_of(root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
 
 
 def facing(orientation: Tensor) -> Tensor:
-    """Rotations (..., 3, 3) about z to where bodies of these orientations (..., 3, 3) face.
+    """Return rotations (..., 3, 3) about z to the headings of bodies with these orientations (..., 3, 3).
 
-    The same as by atan2 of `training.data.dataset.heading`, without an angle between: the official acos has no
-    derivative where the body faces along the axis already.
+    The result equals that of `training.data.dataset.heading` by atan2, without computing an angle. The official code's
+    acos has no derivative where the body faces along the axis.
     """
     x, y = orientation[..., 0, 1], orientation[..., 1, 1]
     length = (x.square() + y.square()).clamp(min=_MIN_LEVEL**2).sqrt()
@@ -100,13 +101,13 @@ def facing(orientation: Tensor) -> Tensor:
 
 
 def canonical(state: State, origin: State) -> State:
-    """``state`` in the canonical frame of ``origin``: its position on the floor, and its heading."""
+    """Transform ``state`` to the canonical frame of ``origin``, given by its position on the floor and its heading."""
     turn = facing(origin.rotations[..., 0, :, :])
     return _turned(_moved(state, -origin.root), turn.mT)
 
 
 def placed(state: State, origin: State) -> State:
-    """The inverse of `canonical`: from the frame of ``origin`` to where that is."""
+    """Invert `canonical`: transform from the canonical frame of ``origin`` to that of ``origin`` itself."""
     turn = facing(origin.rotations[..., 0, :, :])
     return _moved(_turned(state, turn), origin.root)
 
@@ -131,24 +132,24 @@ def _turned(state: State, turn: Tensor) -> State:
 
 
 def features(state: State) -> Tensor:
-    """(..., `FEATURES`) what the networks read of canonical states."""
+    """(..., `FEATURES`) the networks' input from canonical states."""
     columns = state.rotations[..., :2].mT.flatten(-3)
     from_root = (state.joints[..., 1:, :] - state.root.unsqueeze(-2)).flatten(-2)
     return torch.cat([state.root, columns, from_root, state.velocity.flatten(-2), state.turning], dim=-1)
 
 
 def pose_features(inputs: Tensor) -> Tensor:
-    """(..., 133) the `features` that the mixture of initial states is fitted to, of states in their own frames.
+    """(..., 133) the `features` to which the mixture of initial states is fitted, of states in their own frames.
 
-    Height, joints relative to the root, velocities and angular velocity, as in the official code, without the
-    rotations, which follow from the joints except for twists.
+    They are height, joints relative to the root, velocities and angular velocity, as in the official code. Rotations
+    are omitted, because they follow from the joints except for twists.
     """
     of_joints = 3 + 6 * JOINT_COUNT
     return torch.cat([inputs[..., 2:3], inputs[..., of_joints:]], dim=-1)
 
 
 def moved_by(state: State, change: Tensor, offsets: Tensor) -> State:
-    """A step on from canonical states: HuMoR's Euler step, rotations changed from the left.
+    """Advance canonical states by one step: HuMoR's Euler step, with rotations multiplied from the left.
 
     Args:
         state: (...) canonical.
@@ -160,14 +161,14 @@ def moved_by(state: State, change: Tensor, offsets: Tensor) -> State:
 
 
 def posed(before: State, root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
-    """The state of a pose that follows on ``before``, in its frame."""
+    """Return the state of a pose that follows ``before``, in its frame."""
     joints = forward_kinematics(rotations, offsets, root)[0]
     turned = rotations[..., 0, :, :] @ before.rotations[..., 0, :, :].mT
     return State(root, rotations, joints, (joints - before.joints) * FPS, small_log(turned) * FPS)
 
 
 def small_exp(vector: Tensor) -> Tensor:
-    """Rotations (..., 3, 3) of rotation vectors (..., 3): Rodrigues, with derivatives at 0 too."""
+    """Convert rotation vectors (..., 3) to rotations (..., 3, 3) (Rodrigues); differentiable at 0."""
     square = vector.square().sum(dim=-1)[..., None, None]
     angle = (square + 1e-12).sqrt()
     skew = _skew(vector)
@@ -176,7 +177,7 @@ def small_exp(vector: Tensor) -> Tensor:
 
 
 def small_log(rotation: Tensor) -> Tensor:
-    """Rotation vectors (..., 3) of rotations (..., 3, 3) by well under half a turn: of a step, not of any two poses."""
+    """Convert rotations (..., 3, 3) by much less than half a turn, as in one step, to rotation vectors (..., 3)."""
     m = rotation
     axis = (
         torch.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], dim=-1) / 2

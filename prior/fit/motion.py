@@ -1,10 +1,10 @@
-"""A motion under optimisation: the variables, and what follows from them.
+"""A motion under optimisation: its variables, and the quantities that follow from them.
 
-HuMoR varies the first state and the latents of all steps, and rolls the rest out of them: ninety passes one after the
-other for an evaluation, in which an early latent moves everything after it. Here the poses of all frames are varied
-beside the latents, and a term ties each pose to what the decoder makes of the one before and its latent, as firmly as
-the decoder is right (`energy.Transitions`; weak-constraint 4D-Var, or multiple shooting with soft defects). All steps
-are then evaluated at once, and a model that errs bends a motion less than it would as a law.
+HuMoR optimises the first state and the latents of all steps, and rolls out the rest. An evaluation takes ninety
+sequential passes, and an early latent moves everything after it. Here, the poses of all frames are variables as well. A
+term ties each pose to the decoder's prediction from the pose before and its latent, weighted by the decoder's accuracy
+(`energy.Transitions`; weak-constraint 4D-Var, or multiple shooting with soft defects). All steps are then evaluated at
+once, and errors of the model distort a motion less than a hard constraint would.
 """
 
 from __future__ import annotations
@@ -24,32 +24,31 @@ from steadypose.prior.fit.humor_state import JOINT_COUNT, State, canonical, feat
 SCALES: Mapping[str, float] = {
     "root": 0.02, "orientation": 0.05, "turns": 0.05, "bones": 0.01, "ground": 0.02, "latents": 1.0,
 }  # fmt: skip
-"""Metres, radians and standard deviations that a step of 1 of the optimiser stands for."""
+"""Sizes of an optimiser step of 1, metres, radians and standard deviations."""
 
 MAX_LATENT = 3.0
-"""Standard deviations of the prior from its mean, beyond which no latent starts."""
+"""Largest distance of an initial latent from the prior's mean, standard deviations of the prior."""
 
 
 def float_tensor(values: NDArray[np.floating]) -> Tensor:
-    """The same values in single precision, as models take them; a copy where the array is not contiguous."""
+    """Convert values to single precision for models; a copy if the array is not contiguous."""
     return torch.from_numpy(np.ascontiguousarray(values)).float()
 
 
 @dataclass(frozen=True)
 class Variables:
-    """The variables of T frames: the initial poses, which are fixed, and the offset of each from there.
+    """The variables of T frames: the initial poses, which are fixed, and offsets from them.
 
     Attributes:
-        start_root: (T, 3) metres, in the frame of the ground: z up, the floor at 0.
+        start_root: (T, 3) metres, in the frame of the ground: z up, floor at 0.
         start_rotations: (T, 22, 3, 3) local.
         start_offsets: (22, 3) metres, bones.
-        root: (T, 3) metres.
+        root: (T, 3) metres, offsets of the root.
         orientation: (T, 3) rotation vectors of the root, applied from the left.
-        turns: (T, 21, 3) the same of the other joints.
-        bones: (22, 3) metres.
-        ground: (3,) metres by which the floor lies above 0 of the world, and radians by which it is turned about x and
-            y there.
-        latents: (T - 2, latent) from the prior's mean, in its standard deviations.
+        turns: (T, 21, 3) rotation vectors of the other joints, applied from the left.
+        bones: (22, 3) metres, offsets of the bones.
+        ground: (3,) height of the floor above 0 of the world, metres, and its tilts about x and y, radians.
+        latents: (T - 2, latent) relative to the prior's mean, in its standard deviations.
     """
 
     start_root: Tensor
@@ -64,7 +63,7 @@ class Variables:
 
     @classmethod
     def initial(cls, root: Tensor, rotations: Tensor, offsets: Tensor, height: float, latent: int) -> Variables:
-        """Poses (T, ...) in a world whose floor lies at ``height`` metres, with latents at the prior's mean."""
+        """Start from poses (T, ...) in a world with the floor at ``height`` metres, and latents at the prior's mean."""
         down = root.new_tensor([0.0, 0.0, height])
         zero = torch.zeros_like(root)
         turns, latents = zero.unsqueeze(1).repeat(1, JOINT_COUNT - 1, 1), zero.new_zeros(len(root) - 2, latent)
@@ -72,11 +71,11 @@ class Variables:
 
 
 class Motion:
-    """What follows from variables, each computed once, for all terms of the energy.
+    """Quantities that follow from variables, each computed once for all terms of the energy.
 
     Args:
-        model: of transitions.
-        variables: as above.
+        model: the transition model.
+        variables: the variables.
     """
 
     def __init__(self, model: HumorNet, variables: Variables) -> None:
@@ -95,12 +94,12 @@ class Motion:
 
     @property
     def offsets(self) -> Tensor:
-        """(22, 3) metres, this person's bones."""
+        """(22, 3) metres, the person's bones."""
         return self.variables.start_offsets + self.variables.bones
 
     @cached_property
     def _all(self) -> State:
-        # a state takes two frames: the first frame is doubled, so that it has one, at rest
+        # a state needs two frames, so the first frame is doubled and is at rest
         root = torch.cat([self.root[:1], self.root])
         return states_of(root, torch.cat([self.rotations[:1], self.rotations]), self.offsets)
 
@@ -111,12 +110,12 @@ class Motion:
 
     @property
     def states(self) -> State:
-        """(T - 1) states, from the second frame on: the first has no velocity."""
+        """(T - 1) states, from the second frame on; the first has no velocity."""
         return self._all[1:]
 
     @cached_property
     def world_joints(self) -> Tensor:
-        """(T, 22, 3) metres in the world that observations are in."""
+        """(T, 22, 3) metres in the world of the observations."""
         return self.joints @ self.tilt.mT + self.ground_height
 
     @property
@@ -127,7 +126,7 @@ class Motion:
 
     @property
     def ground_height(self) -> Tensor:
-        """(3,) metres: where the floor is under 0 of the world."""
+        """(3,) metres, the point of the floor at the world's origin."""
         return self.variables.ground[:1] * self.variables.ground.new_tensor([0.0, 0.0, 1.0])
 
     @cached_property
@@ -141,7 +140,7 @@ class Motion:
 
     @cached_property
     def predicted(self) -> tuple[State, Tensor]:
-        """(T - 2) the decoder's next state of each state but the last, and logits of contacts (T - 2, 16)."""
+        """(T - 2) the decoder's next state for each state except the last, and contact logits (T - 2, 16)."""
         inputs = self.inputs[:-1]
         prior = self.model.prior_latent(inputs)
         latents = prior.mean + prior.sigma * self.variables.latents
@@ -150,6 +149,6 @@ class Motion:
 
     @torch.no_grad()
     def encoded_latents(self) -> Tensor:
-        """(T - 2, latent) the encoder's means, from the prior's, in standard deviations of the prior."""
+        """(T - 2, latent) the encoder's means relative to the prior's, in standard deviations of the prior."""
         posterior, prior = transitions(self.model, self.states)
         return ((posterior.mean - prior.mean) / prior.sigma).clamp(-MAX_LATENT, MAX_LATENT)

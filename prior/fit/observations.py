@@ -17,42 +17,42 @@ from steadypose.prior.fit.energy import Term, bisquare, geman_mcclure, huber
 from steadypose.prior.fit.motion import Motion
 
 ROBUST = 5.0
-"""Standard deviations from which on a key point or a point of the surface counts as an outlier."""
+"""Residual above which a key point or a point of the surface is an outlier, standard deviations."""
 
 CLEAR = 3.0
-"""Standard deviations from which on a joint in space pulls no harder; none is given up: there may be no other."""
+"""Residual above which the pull of a 3D joint is constant, standard deviations. No joint is ignored altogether."""
 
 MOST_POINTS = 200
-"""Of a surface, a frame, that are fitted."""
+"""Largest number of surface points per frame that are fitted."""
 
 POINT_SHARE = 0.03
-"""Of points beside joints in space: what capsules and a depth camera get wrong lasts, and so many points in so many
-frames would outvote joints that are right (benchmarks/NOTEBOOK.md)."""
+"""Weight of a surface point if there are 3D joints. The errors of capsules and of a depth camera last, so that many
+points in many frames would outvote correct joints (benchmarks/NOTEBOOK.md)."""
 
 POINT_SIGMA = 0.05
-"""Metres: error of a depth camera's points five metres away, and of capsules as a body. A limb finds its points within
-`ROBUST` times that."""
+"""Standard deviation of surface points, metres: error of a depth camera at five metres, and of capsules as a body
+model. Limbs are attracted by points within `ROBUST` times this distance."""
 
 
 class Observed(Term, Protocol):
     """Observations of T frames."""
 
     def between(self, first: int, last: int) -> Observed:
-        """Those of the frames ``first`` to ``last - 1``."""
+        """Return the observations of the frames ``first`` to ``last - 1``."""
         ...
 
     def misfit(self, motion: Motion) -> Tensor:
-        """(T, 22) distance of each joint from its observation: metres, or pixels; NaN where there is none."""
+        """(T, 22) distance of each joint from its observation, metres or pixels; NaN if there is none."""
         ...
 
 
 @dataclass(frozen=True)
 class SeenJoints:
-    """E_data of joints or key points in space, some of them hidden.
+    """E_data of 3D joints or key points, some of them hidden.
 
     Attributes:
-        positions: (T, 22, 3) metres, world; NaN where not seen.
-        sigma: (T, 22) metres along an axis.
+        positions: (T, 22, 3) metres, world; NaN where unobserved.
+        sigma: (T, 22) metres along an axis, standard deviations.
     """
 
     positions: Tensor
@@ -82,7 +82,7 @@ class Pinhole:
     Attributes:
         focal: (2,) pixels.
         centre: (2,) pixels.
-        rotation: (3, 3) from its optical frame (x right, y down, z forward) to the world.
+        rotation: (3, 3) rotation from its optical frame (x right, y down, z forward) to the world.
         position: (3,) metres, world.
     """
 
@@ -99,13 +99,13 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """E_data of key points in an image, weighted by their confidence, under Geman's and McClure's kernel.
+    """E_data of key points in an image, weighted by their confidence, with the Geman-McClure kernel.
 
     Attributes:
-        pixels: (T, 22, 2); NaN where not found.
-        confidence: (T, 22) 0 to 1, a weight as in the paper; its square is the official code's.
-        camera: of the image.
-        sigma: pixels along an axis.
+        pixels: (T, 22, 2); NaN where not detected.
+        confidence: (T, 22) 0 to 1, the weight, as in the paper; the official code uses its square.
+        camera: the camera.
+        sigma: pixels along an axis, standard deviation.
     """
 
     pixels: Tensor
@@ -139,16 +139,16 @@ _RADII = torch.tensor([radius for _, _, radius in CAPSULES])
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """E_data of points of a depth camera: how far each is from where the camera sees the nearest capsule about a bone.
+    """E_data of a depth camera's points: the distance of each from the visible side of the nearest bone's capsule.
 
-    A camera sees the side of a body that is turned to it. The distance from a closed surface would let a point that
-    noise puts behind a limb's middle pull towards its back, and those in front of it alone would then move the body.
+    A camera sees only the side of a body that faces it. With the distance from a closed surface, a point that noise
+    puts behind a limb's centre would pull towards the limb's back, and the points in front would then bias the body.
 
     Attributes:
-        points: (T, N, 3) metres, world; NaN where there are fewer.
-        camera: (3,) metres, world, where it stands, or (T, 3).
-        sigma: metres.
-        weight: share of a point that counts, for neighbours err alike.
+        points: (T, N, 3) metres, world, padded with NaN.
+        camera: (3,) or (T, 3) metres, world, position of the camera.
+        sigma: metres, standard deviation.
+        weight: weight of a point, below 1 because neighbouring errors are correlated.
     """
 
     points: Tensor
@@ -162,12 +162,12 @@ class SurfacePoints:
 
     @cached_property
     def _rays(self) -> Tensor:
-        """(P, 3) unit vectors from the camera to the points seen."""
+        """(P, 3) unit vectors from the camera to the observed points."""
         away = (self.points - self.camera.reshape(-1, 1, 3))[self._seen]
         return away / away.norm(dim=-1, keepdim=True)
 
     def residual(self, motion: Motion) -> Tensor:
-        """(P, 2) along the ray and across it."""
+        """(P, 2) residuals along the ray and across it."""
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         points, joints = self.points[self._seen], motion.world_joints
         radii = _RADII.to(joints.dtype) * (stature(motion.offsets.detach().numpy()) / REST_HEIGHT)
@@ -187,7 +187,7 @@ class SurfacePoints:
         return replace(self, points=self.points[first:last], camera=camera)
 
     def misfit(self, motion: Motion) -> Tensor:
-        """(T, 22) the median distance of a frame's points, metres, for every joint: points belong to none."""
+        """(T, 22) median distance of a frame's points, metres, equal for all joints, as points belong to no joint."""
         off = self.residual(motion).norm(dim=-1) * self.sigma
         frames, _ = torch.nonzero(self._seen, as_tuple=True)
         found = torch.full((len(self.points), motion.joints.shape[1]), torch.nan)
@@ -197,12 +197,12 @@ class SurfacePoints:
 
 
 def thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """About `MOST_POINTS` of points (T, N, 3) a frame, evenly: neighbours err alike, and say nothing new."""
+    """Thin points (T, N, 3) evenly to about `MOST_POINTS` per frame; neighbours with correlated errors add little."""
     return points[:, :: max(points.shape[1] // MOST_POINTS, 1)]
 
 
 def _off(points: Tensor, rays: Tensor, starts: Tensor, ends: Tensor, radii: Tensor) -> Tensor:
-    """(..., 2) metres from capsules to points seen along unit rays: behind the side that is seen, and beside them."""
+    """(..., 2) metres from capsules to points along unit rays: behind the visible side, and beside the capsules."""
     bone = ends - starts
     share = ((points - starts) * bone).sum(dim=-1) / bone.square().sum(dim=-1).clamp(min=1e-8)
     off = points - starts - share.clamp(0.0, 1.0).unsqueeze(-1) * bone

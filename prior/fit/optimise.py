@@ -1,8 +1,9 @@
-"""Motion by search through HM-VAE (section 4, equations 14 and 15): latent vectors first, then the decoder too.
+"""Motion completion by optimisation through HM-VAE (section 4, equations 14 and 15): latents first, then the decoder
+too.
 
-The paper starts from random latent vectors; here they are those of the completer's output. Unlike the official code,
-losses are means over what is known only, the best iterate is kept and not the last, and the output meets what is known
-without a step, where the official one overwrites key frames. It needs torch.
+The paper starts from random latents; here, they are encoded from the completer's output. There are three differences
+from the official code: losses are means over known entries only, the best iterate is kept instead of the last, and the
+output meets the known poses without a step, where the official code overwrites key frames. It needs torch.
 """
 
 from __future__ import annotations
@@ -25,32 +26,32 @@ from steadypose.prior.models.completer_features import anchored, draw_line, rota
 from steadypose.prior.models.hmvae import HMVAEConfig
 
 MODEL = "hmvae64"
-"""Its weights' name."""
+"""Name of the model's weights."""
 
 LATENT_STEPS, LATENT_RATE, RANDOM_RATE = 50, 0.01, 0.1
 DECODER_STEPS, DECODER_RATE = 100, 1e-4
-"""Of Adam, in the first phase over the latent vectors and in the second over the decoder too. The official rate of the
-latent vectors is that of random ones; from the completer's it takes them far away (benchmarks/NOTEBOOK.md)."""
+"""Steps and learning rates of Adam, in the first phase over the latents and in the second over the decoder too. The
+official rate of the latents suits random ones; it moves the completer's latents too far (benchmarks/NOTEBOOK.md)."""
 
 JOINT_WEIGHT = 10.0
-"""lambda_1 of equation 14."""
+"""Weight lambda_1 of equation 14."""
 
 STAY_WEIGHT = 1000.0
-"""lambda_2 of equation 15: of the mean square change of each of the decoder's tensors."""
+"""Weight lambda_2 of equation 15, of the mean squared change of each of the decoder's tensors."""
 
 AGREE_WEIGHT = 1.0
-"""Of the mean square difference of windows where they overlap."""
+"""Weight of the mean squared difference between overlapping windows."""
 
 
 @dataclass(frozen=True)
 class _Known:
-    """What is known of W windows of T frames, in the windows' frames.
+    """The known entries of W windows of T frames, in the windows' frames.
 
     Attributes:
         columns: (W, T, 22, 6) first two columns of local rotations.
-        rotations: (W, T, 22, 1) 1 where these are known, else 0.
-        joints: (W, T, 22, 3) metres from the root.
-        places: (W, T, 22, 1) 1 where these are known, else 0.
+        rotations: (W, T, 22, 1) 1 where rotations are known, else 0.
+        joints: (W, T, 22, 3) metres relative to the root.
+        places: (W, T, 22, 1) 1 where joints are known, else 0.
         offsets: (22, 3) metres, bones.
     """
 
@@ -61,7 +62,7 @@ class _Known:
     offsets: Tensor
 
     def loss(self, decoded: Tensor) -> Tensor:
-        """Equation 14 for windows (W, T, 22, 6), each term a mean over what is known."""
+        """Equation 14 for windows (W, T, 22, 6); each term is a mean over known entries."""
         matrices = from_6d(decoded)
         joints, _ = forward_kinematics(matrices, self.offsets)
         count = self.rotations.sum().clamp(min=1.0)
@@ -72,12 +73,12 @@ class _Known:
 
 
 class Optimiser:
-    """Completes windows as `PartsCompleter` does, by search from its output.
+    """Completes windows like `PartsCompleter`, by optimisation from its output.
 
     Args:
-        model: whose windows are searched.
-        completer: of the initial motion, and of the root.
-        seed: of random initial latent vectors, as in the paper; None: those of the completer's output.
+        model: the model to optimise through.
+        completer: gives the initial motion, and the root.
+        seed: random seed of initial latents, as in the paper; None for the latents of the completer's output.
     """
 
     def __init__(self, model: HMVAE, completer: PartsCompleter, seed: int | None = None) -> None:
@@ -85,22 +86,22 @@ class Optimiser:
 
     @classmethod
     def load(cls, weights: str, completer: PartsCompleter, seed: int | None = None) -> Optimiser:
-        """With the weights of this name.
+        """Load the weights of this name.
 
         Raises:
-            FileNotFoundError: there are none; says which there are.
+            FileNotFoundError: there are none; the message lists those that exist.
         """
         return cls(load_network(HMVAE, HMVAEConfig.from_dict, weights, MODEL), completer, seed)
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """As `PartsCompleter`: local rotations (B, T, 22, 3, 3), and the completer's root (B, T, 3), metres."""
+        """Return local rotations (B, T, 22, 3, 3), and the completer's root (B, T, 3) metres, like `PartsCompleter`."""
         rotations, root = self._completer(positions, offsets)
         for window in range(len(positions)):
             rotations[window] = self._searched(positions[window], offsets[window], rotations[window])
         return rotations, root
 
     def _searched(self, positions: Floats, offsets: Floats, start: Floats) -> Floats:
-        """Rotations (T, 22, 3, 3) of one window, from the completer's, ``start`` (T, 22, 3, 3)."""
+        """Optimise the rotations (T, 22, 3, 3) of one window, from the completer's ``start`` (T, 22, 3, 3)."""
         usual = rotation_matrices(self._completer.usual)
         solved, known = solved_rotations(positions, np.broadcast_to(offsets, positions.shape), usual)
         frames, length = len(positions), self._model.window
@@ -128,7 +129,7 @@ class Optimiser:
         return self._meeting_known(columns / total[:, None, None], given, known)
 
     def _search(self, begun: Tensor, seen: _Known, starts: NDArray[np.int64], back: Tensor) -> Tensor:
-        """The windows (W, T, 22, 6) of least loss over all iterations."""
+        """Return the windows (W, T, 22, 6) of least loss over all iterations."""
         model = copy.deepcopy(self._model)  # phase two changes its decoder
         with torch.no_grad():
             posterior = model.encode(begun)
@@ -167,7 +168,7 @@ class Optimiser:
         return best
 
     def _meeting_known(self, columns: Floats, given: Floats, known: NDArray[np.bool_]) -> Floats:
-        """Rotations (T, 22, 3, 3) of ``columns`` (T, 22, 6), corrected in time so that known ones are as given."""
+        """Return rotations (T, 22, 3, 3) from ``columns`` (T, 22, 6), corrected over time to meet the known ones."""
         line = draw_line(known[None])
         wanted = given[..., :2].swapaxes(-1, -2).reshape(columns.shape)
         off = np.where(known[..., None], wanted - columns, 0.0)[None]
@@ -180,7 +181,7 @@ def _mask(known: NDArray[np.bool_]) -> Tensor:
 
 
 def _disagreement(decoded: Tensor, starts: NDArray[np.int64], back: Tensor) -> Tensor:
-    """The mean square by which windows (W, T, 22, 6), each turned by ``back`` (W, 3, 3), differ where they overlap."""
+    """Mean squared difference of overlapping windows (W, T, 22, 6), each turned by ``back`` (W, 3, 3)."""
     total = decoded.new_zeros(())
     turned = from_6d(decoded)
     for k in range(len(starts) - 1):

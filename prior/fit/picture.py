@@ -1,9 +1,9 @@
-"""Fits to key points of one camera: initial poses, and what is to be fitted.
+"""Fits to key points of one camera: initial poses, and tracks to fit.
 
-With points of a depth camera, each key point is as far away as the surface about it in the image. Without, depth
-follows from where the rays of feet meet a floor that is known, or from the longest bones in the image, for these lie
-across the line of sight; the angle of the heading from the widths of hips and shoulders, its sign from where the toes
-point. Where no toes are seen there are two starts, of which the fit of less energy is taken.
+With points of a depth camera, a key point has the depth of the surface around it in the image. Without them, depth
+follows from the intersection of the feet's rays with a known floor, or from the longest bones in the image, which lie
+across the line of sight. The widths of hips and shoulders give the angle of the heading, the direction of the toes its
+sign. If no toes are visible, there are two starts, and the fit with less energy is used.
 """
 
 from __future__ import annotations
@@ -38,39 +38,39 @@ _BONES = [(J[a], J[b]) for side in ("left", "right") for a, b in (
     (f"{side}_elbow", f"{side}_wrist"), (f"{side}_hip", f"{side}_shoulder"),
 )]  # fmt: skip
 _ACROSS = 80.0
-"""Percentile of the ratios of bones' lengths in the picture to their own that counts as that of a bone across the line
-of sight; the largest is as likely an outlier."""
+"""Percentile of the ratios of bones' lengths in the image to their actual lengths that is assigned to a bone across the
+line of sight; the largest ratio may be an outlier."""
 _MEDIAN_FRAMES, _SMOOTHING_SIGMA = 5, 3.0
-"""Window of the median filter and standard deviation of the Gaussian one, of root and heading, frames."""
+"""Window of the median filter and standard deviation of the Gaussian filter of root and heading, frames."""
 
 _REACH, _NEAREST = 0.08, 5
-"""Distance in the image within which a point gives a key point's depth, metres there; and number of such points."""
+"""Largest distance in the image between a key point and points that give its depth, metres; number of such points."""
 _FLESH = np.array([max((r for a, b, r in CAPSULES if name in (a, b)), default=0.1) for name in JOINTS])
 """Distance from the skin to each joint, metres."""
 _SIZES = 0.6, 1.25
-"""Least and largest size that the floor may give, of the initial bones'."""
+"""Least and largest size from the floor, relative to the initial bones."""
 _ANKLES_TOES = [(J[f"{side}_ankle"], J[f"{side}_foot"]) for side in ("left", "right")]
 _FEET = np.array(CONTACT_JOINTS[2:6])
 _AHEAD, _STRIDE, _STANDS = 0.2, 15, 30.0
-"""Distance by which the nearest foot is nearer than the root, metres; frames of the percentile filter over which a foot
-stands at times, and its percentile."""
+"""Distance by which the nearest foot is nearer than the root, metres; window of the percentile filter in which a foot
+stands at some time, frames; and its percentile."""
 
 
 def starts_of_key_points(
     pixels: Floats, camera: Pinhole, offsets: Floats, ground: float, *, floor_known: bool = False
 ) -> list[Start]:
-    """Motions of a body in the rest pose, without depth.
+    """Return initial motions of a body in the rest pose, without depth measurements.
 
     Args:
-        pixels: (T, 22, 2), NaN where not found.
-        camera: that took it.
+        pixels: (T, 22, 2), NaN where not detected.
+        camera: the camera.
         offsets: (22, 3) metres, initial bones.
         ground: metres, world, initial height of the floor.
-        floor_known: whether that is so, not a guess: the body is then as large as one that stands on it.
+        floor_known: whether that height is known and not guessed; it then determines the body's size.
 
     Returns:
-        A body in the rest pose with its arms down, that follows the key points in place and heading; where no toes are
-        seen, one with its left side away from the camera and one with it towards the camera.
+        A body in the rest pose with its arms down, which follows the key points in position and heading. If no toes are
+        visible, there are two: one with its left side away from the camera and one with it towards the camera.
     """
     focal, centre = camera.focal.numpy().astype(float), camera.centre.numpy().astype(float)
     rotation, position = camera.rotation.numpy().astype(float), camera.position.numpy().astype(float)
@@ -99,8 +99,10 @@ def starts_of_key_points(
 
 
 def lift(pixels: Floats, camera: Pinhole, points: Floats) -> Floats:
-    """(T, 22, 3) metres, world: key points (T, 22, 2) behind the surface that points (T, N, 3) show about them; NaN
-    where there is none."""
+    """Lift key points (T, 22, 2) to (T, 22, 3) metres, world, behind the surface of the points (T, N, 3) around them.
+
+    Key points without surface points around them are NaN.
+    """
     focal, centre = camera.focal.numpy().astype(float), camera.centre.numpy().astype(float)
     rotation, position = camera.rotation.numpy().astype(float), camera.position.numpy().astype(float)
     seen = (points - position) @ rotation
@@ -123,9 +125,9 @@ def lift(pixels: Floats, camera: Pinhole, points: Floats) -> Floats:
 
 
 def _standing_depth(rays: Floats, rotation: Floats, position: Floats, ground: float) -> Floats | None:
-    """(T,) metres along the optical axis to the root of a body that stands on the floor; None if no foot is seen there.
+    """(T,) metres along the optical axis to the root of a body that stands on the floor; None if no foot is visible.
 
-    The ray of a foot that stands meets the floor where the foot is, that of one in the air farther away.
+    The ray of a standing foot meets the floor at the foot, the ray of a foot in the air farther away.
     """
     feet = np.concatenate([rays[:, _FEET], np.ones((len(rays), len(_FEET), 1))], axis=-1) @ rotation.T
     drop = ground + np.array(REST_HEIGHT)[2:6] - position[2]
@@ -139,7 +141,7 @@ def _standing_depth(rays: Floats, rotation: Floats, position: Floats, ground: fl
 
 
 def _depth(rays: Floats, rest: Floats) -> Floats:
-    """(T,) metres along the optical axis, of key points (T, 22, 2) at depth 1, by the bones of the pose ``rest``."""
+    """(T,) metres along the optical axis, from key points (T, 22, 2) at depth 1 and the bones of the pose ``rest``."""
     a, b = np.array(_BONES).T
     lengths = np.linalg.norm(rest[b] - rest[a], axis=-1)
     ratios = np.linalg.norm(rays[:, b] - rays[:, a], axis=-1) / lengths
@@ -148,7 +150,7 @@ def _depth(rays: Floats, rest: Floats) -> Floats:
 
 
 def _across(rays: Floats, depth: Floats, rest: Floats) -> Floats:
-    """(T,) component, -1 to 1, of the body's left axis along the picture's x, by the widths of hips and shoulders."""
+    """(T,) component, -1 to 1, of the body's left axis along the image's x, from the widths of hips and shoulders."""
     widths = [
         (rays[:, left, 0] - rays[:, right, 0]) * depth / np.linalg.norm(rest[left] - rest[right])
         for left, right in (HIPS, SHOULDERS)
@@ -158,8 +160,10 @@ def _across(rays: Floats, depth: Floats, rest: Floats) -> Floats:
 
 
 def _toes(rays: Floats) -> Floats | None:
-    """(T,) 1 where toes point to the right of the picture, so that the left side is the far one, -1 where to the left;
-    None where they are not seen in half of the frames."""
+    """(T,) 1 if toes point to the right of the image, so that the left side is farther, -1 if to the left.
+
+    None if the toes are not visible in half of the frames.
+    """
     pointing = np.stack([rays[:, toe, 0] - rays[:, ankle, 0] for ankle, toe in _ANKLES_TOES], axis=1)
     if np.isfinite(pointing).any(axis=1).mean() < 0.5:
         return None
@@ -168,7 +172,7 @@ def _toes(rays: Floats) -> Floats | None:
 
 
 def _arms_down(offsets: Floats) -> Floats:
-    """(22, 3) metres from the pelvis: the rest pose of these bones, with the arms down."""
+    """(22, 3) metres relative to the pelvis, rest pose with these bones and the arms down."""
     pose = REST_POSITIONS.copy()
     for side in ("left", "right"):
         shoulder = pose[J[f"{side}_shoulder"]]
@@ -196,16 +200,16 @@ def _interpolated(values: Floats) -> Floats:
 
 
 Clean = Callable[[Floats], Floats]
-"""Joints (T, 22, 3) metres, world, at 30 Hz, as `steadypose clean` leaves them; NaN where nobody."""
+"""Type of `steadypose clean` as a function: joints (T, 22, 3) metres, world, at 30 Hz; NaN without a body."""
 
 PIXEL_SIGMA = 0.01
-"""Standard deviation of a key point in the picture, in focal lengths."""
+"""Standard deviation of a key point in the image, focal lengths."""
 
 CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
-"""Height of a camera above the floor where it is not known, and its standard deviation, in metres."""
+"""Assumed height of a camera above the floor if it is unknown, and its standard deviation, metres."""
 
 LIFTED_SIGMA = 0.08
-"""Standard deviation along an axis of key points as deep as the surface about them, in metres."""
+"""Standard deviation along an axis of key points with the depth of the surface around them, metres."""
 
 
 def track_of_picture(
@@ -218,18 +222,18 @@ def track_of_picture(
     points: Floats | None = None,
     clean: Clean,
 ) -> Track:
-    """What is to be fitted of a person in a picture, and the motions to start from.
+    """Build the track to fit of a person in images, with initial motions.
 
-    With points, the start is what `clean` says of the key points as deep as the surface about them, which are observed
-    too; without, or if it finds nobody, it is that of `starts_of_key_points`.
+    With points, key points get the depth of the surface around them. They are observations, and the start is `clean`
+    applied to them. Without points, or if `clean` finds nobody, the start is that of `starts_of_key_points`.
 
     Args:
-        pixels: (T, 22, 2) at 30 Hz, NaN where not found.
+        pixels: (T, 22, 2) at 30 Hz, NaN where not detected.
         confidence: (T, 22) 0 to 1.
-        camera: that took it.
-        floor: metres, world, its height, or a guess.
-        floor_known: which of the two.
-        points: (T, N, 3) metres, world, of the body's surface, NaN where there are fewer; None if there are none.
+        camera: the camera.
+        floor: metres, world, height of the floor, known or guessed.
+        floor_known: whether the height is known.
+        points: (T, N, 3) metres, world, points of the body's surface, padded with NaN; None if there are none.
         clean: `steadypose clean`.
     """
     sigma = PIXEL_SIGMA * float(camera.focal.mean())
@@ -244,7 +248,7 @@ def track_of_picture(
 
 
 def _start_of_joints(cleaned: Floats, floor: float) -> list[Start]:
-    """The motion of joints (T, 22, 3) metres, world; none where half of them or more are NaN."""
+    """Return the motion of joints (T, 22, 3) metres, world; none if half of them or more are NaN."""
     known = np.flatnonzero(np.isfinite(cleaned).all(axis=(1, 2)))
     if 2 * len(known) < len(cleaned):
         return []
@@ -255,7 +259,7 @@ def _start_of_joints(cleaned: Floats, floor: float) -> list[Start]:
 
 
 def track_of_key_points(recording: KeyPointRecording, clean: Clean) -> Track:
-    """As `track_of_picture`, of a recording; the camera is at the origin of the world."""
+    """Build the track of a recording (see `track_of_picture`), with the camera at the world's origin."""
     camera = Pinhole(
         float_tensor(recording.focal),
         float_tensor(recording.centre),
@@ -288,7 +292,7 @@ def fit_key_points(
 
 
 def arrays_of_fit(recording: KeyPointRecording, track: FittedTrack) -> dict[str, NDArray[Any]]:
-    """As ``steadypose clean`` writes them, in the camera's frame, at 30 Hz; of deviations and anomalies, none."""
+    """Return the arrays of ``steadypose clean``, in the camera's frame, at 30 Hz, without deviations and anomalies."""
     rotations = track.rotations.copy()
     rotations[:, 0] = recording.rotation.T @ rotations[:, 0]
     seen = np.asarray(np.isfinite(recording.pixels).all(axis=-1))

@@ -1,8 +1,9 @@
-"""A fitted motion as that of SMPL or SMPL-H, for the tools that read AMASS' files.
+"""Converts a fitted motion to SMPL or SMPL-H, for tools that read AMASS' files.
 
-Of the user's own model file only what joints follow from is read: where SMPL has them in its rest pose is linear in
-the betas, and from there on it is forward kinematics; skin and its blend shapes move no joint (Loper et al. 2015,
-equations 2 to 4 and 10). So neither the package `smplx` is needed, which is not free for products, nor a file of ours.
+Only the data that determine joints are read from the user's own model file. In SMPL, the joints of the rest pose are
+linear in the betas, and the rest is forward kinematics; skin and blend shapes move no joint (Loper et al. 2015,
+equations 2 to 4 and 10). Neither the package `smplx`, which is not free for products, nor a model file of ours is
+needed.
 """
 
 from __future__ import annotations
@@ -26,26 +27,27 @@ from steadypose.prior.npz import MotionError, open_npz
 from steadypose.prior.timing.rate import FPS
 
 BETAS, POSES = 16, 156
-"""Numbers that AMASS has of a shape; and of a pose, SMPL-H's 52 rotation vectors, of which hands are 0 here."""
+"""Numbers of values of a shape and of a pose in AMASS. A pose is SMPL-H's 52 rotation vectors; those of the hands are
+0."""
 
 LENGTH_SIGMA, JOINT_SIGMA, TURN_SIGMA = 0.01, 0.01, 0.3
-"""Metres that SMPL's bones and joints may be off by, and radians that a joint may turn from where inverse kinematics
-has it, against betas of a standard deviation of 1: what betas cannot explain is not to be explained by monsters."""
+"""Standard deviations of SMPL's bones and joints, metres, and of a joint's rotation from inverse kinematics, radians,
+relative to betas of standard deviation 1. They prevent extreme shapes where betas cannot explain the joints."""
 
 STEPS = 100
 
 _AXES = [2, 0, 1]
-"""SMPL's rest pose has left, up and forward as its axes, ours has forward, left and up."""
+"""Permutation of axes: SMPL's rest pose has left, up and forward as its axes, ours has forward, left and up."""
 
 
 @dataclass(frozen=True)
 class SmplShape:
-    """Where a model has its first 22 joints, in the rest pose.
+    """A model's first 22 joints in the rest pose.
 
     Attributes:
-        rest: (22, 3) metres, of the mean shape; x forward, y left, z up.
-        change: (22, 3, B) metres of each beta, B up to `BETAS`.
-        gender: as the file's name says.
+        rest: (22, 3) metres, joints of the mean shape; x forward, y left, z up.
+        change: (22, 3, B) metres per unit of each beta, B up to `BETAS`.
+        gender: gender in the file's name.
     """
 
     rest: Floats
@@ -54,16 +56,16 @@ class SmplShape:
 
     @classmethod
     def read(cls, path: Path) -> SmplShape:
-        """From a model's ``.npz``.
+        """Read a model's ``.npz``.
 
         Raises:
-            MotionError: it has not what SMPL's and SMPL-H's have; says what was expected.
+            MotionError: it lacks the arrays of SMPL and SMPL-H; the message says what was expected.
         """
         with open_npz(path, "v_template", "shapedirs", "J_regressor", "kintree_table") as arrays:
             try:
                 vertices, shapes = arrays["v_template"].astype(np.float64), arrays["shapedirs"].astype(np.float64)
                 regressor, tree = arrays["J_regressor"].astype(np.float64), np.asarray(arrays["kintree_table"])
-            except ValueError as error:  # of pickled objects, such as sparse matrices
+            except ValueError as error:  # raised for pickled objects, such as sparse matrices
                 raise MotionError(f"{path}: expected arrays of numbers: {error}") from error
         joints = len(PARENTS)
         got = f"v_template {vertices.shape}, shapedirs {shapes.shape}, J_regressor {regressor.shape}"
@@ -81,11 +83,11 @@ class SmplShape:
         return cls((regressor @ vertices)[:, _AXES], change[:, _AXES], gender)
 
     def joints(self, betas: Floats) -> Floats:
-        """(22, 3) metres in the rest pose, of betas (B,)."""
+        """(22, 3) metres, joints in the rest pose for betas (B,)."""
         return self.rest + self.change @ betas
 
     def of_lengths(self, lengths: Floats) -> Floats:
-        """Betas (B,) whose bones are about as long as these (22,), metres; the root's is passed over."""
+        """Fit betas (B,) to bone lengths (22,), metres; the root's is ignored."""
 
         def residuals(betas: Floats) -> Floats:
             placed = self.joints(betas)
@@ -102,9 +104,9 @@ class SmplMotion:
     Attributes:
         poses: (T, `POSES`) radians, rotation vectors, the root's first.
         betas: (`BETAS`,) 0 where the model has fewer.
-        trans: (T, 3) metres.
-        gender: of the model.
-        joints: (T, 22, 3) metres: where the model's are.
+        trans: (T, 3) metres, translations.
+        gender: gender of the model.
+        joints: (T, 22, 3) metres, the model's joints.
     """
 
     poses: Floats
@@ -115,7 +117,7 @@ class SmplMotion:
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """As AMASS names them."""
+        """Return the arrays under AMASS' names."""
         return {
             "poses": self.poses, "betas": self.betas, "trans": self.trans, "gender": np.array(self.gender),
             "mocap_framerate": np.array(float(FPS)),
@@ -123,12 +125,12 @@ class SmplMotion:
 
 
 def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion:
-    """The motion of a model whose joints are nearest to these.
+    """Fit a model's motion to joints.
 
     Args:
-        shape: of the model.
-        joints: (T, 22, 3) metres, z up, in no frame missing.
-        lengths: (22,) metres, of bones.
+        shape: shape of the model.
+        joints: (T, 22, 3) metres, z up, complete.
+        lengths: (22,) metres, bone lengths.
     """
     betas = shape.of_lengths(lengths)
     rest = shape.joints(betas)
@@ -152,7 +154,7 @@ def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion
     def closure() -> torch.Tensor:
         optimiser.zero_grad()
         beta, turns, _, reached = posed()
-        # bones of another model are off alike in all frames: together these say of betas what one says
+        # another model's bones have the same errors in all frames, so together the frames count like one for betas
         energy = len(target) * beta.square().sum() + (turns / TURN_SIGMA).square().sum()
         energy = energy + ((reached - target) / JOINT_SIGMA).square().sum()
         energy.backward()

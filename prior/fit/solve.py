@@ -18,13 +18,13 @@ from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
 POSES = ("root", "orientation", "turns")
 
 ROUND = 10
-"""Steps of L-BFGS between two checks for convergence."""
+"""Number of L-BFGS steps between two convergence checks."""
 
 STIFFNESS = 30.0
 """Ratio of the curvatures of the motion terms and of the observations: about the square of 4 cm over 7 mm."""
 
 TOLERANCE = 1e-4
-"""Share of the energy: a round that gains less is the last."""
+"""Relative decrease of the energy below which a round is the last."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +32,16 @@ class FitSettings:
     """Steps of each stage and standard deviation of each term, chosen on validation people.
 
     Attributes:
-        root_steps, pose_steps, motion_steps: of L-BFGS, of up to five evaluations each.
-        smooth_sigma: m/s², of stage 2.
-        pose_sigma: of `FirstState` as a prior of all states, in stage 2.
-        transitions: of stage 3.
-        first_sigma: of `FirstState` as a prior of all states, in stage 3.
-        motion_smooth_sigma: m/s², of stage 3: against the jitter that the model of motion allows.
-        standing: of stage 3.
-        bones_sigma: metres.
-        ground_height_sigma: metres, where the ground is not known.
-        ground_tilt_sigma: radians, likewise.
+        root_steps, pose_steps, motion_steps: numbers of L-BFGS steps, with up to five evaluations each.
+        smooth_sigma: m/s², of `Smooth` in stage 2.
+        pose_sigma: of `FirstState` as a prior of all states in stage 2.
+        transitions: the transition term of stage 3.
+        first_sigma: of `FirstState` as a prior of all states in stage 3.
+        motion_smooth_sigma: m/s², of `Smooth` in stage 3, against jitter that the motion model allows.
+        standing: the contact term of stage 3.
+        bones_sigma: metres, of `Bones`.
+        ground_height_sigma: metres, of `Ground` if the ground is unknown.
+        ground_tilt_sigma: radians, of `Ground` if the ground is unknown.
     """
 
     root_steps: int = 30
@@ -59,7 +59,7 @@ class FitSettings:
 
 
 PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200)
-"""Settings for key points of an image, which determine a person's size less, and start farther off."""
+"""Settings for key points of an image, which determine size less well and start farther from the solution."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Start:
         rotations: (T, 22, 3, 3) local.
         offsets: (22, 3) metres, bones.
         ground: metres, height of the floor.
-        ground_known: whether that is certain, as with a calibrated camera, or the mean of a prior.
+        ground_known: whether the height is certain, as for a calibrated camera; if not, it is the mean of a prior.
     """
 
     root: Tensor
@@ -84,7 +84,7 @@ class Start:
     def of(
         cls, root: Floats, rotations: Floats, offsets: Floats, ground: float = 0.0, *, ground_known: bool = False
     ) -> Start:
-        """From arrays of the same shapes."""
+        """Build the start from arrays of the same shapes."""
         return cls(float_tensor(root), float_tensor(rotations), float_tensor(offsets), ground, ground_known)
 
 
@@ -93,8 +93,8 @@ class Fitted:
     """The fit of a window.
 
     Attributes:
-        motion: of least energy, without gradients.
-        energies: (stages,) nats at the end of each stage, of that stage's terms.
+        motion: motion of least energy, without gradients.
+        energies: (stages,) nats, energy of a stage's terms at its end.
     """
 
     motion: Motion
@@ -111,15 +111,15 @@ def fit_window(
     stages: int = 3,
     advanced: Callable[[], None] = lambda: None,
 ) -> Fitted:
-    """Fit a window of some seconds, three frames at least.
+    """Fit a window of a few seconds, at least three frames.
 
     Args:
-        model: of transitions, in evaluation mode.
+        model: the transition model, in evaluation mode.
         start: initial poses.
         observed: terms of the observations.
-        settings: of stages and terms.
+        settings: settings of stages and terms.
         anchor: the frames shared with the window before.
-        stages: how many; 2 stops before the model of motion: HuMoR's VPoser-t.
+        stages: number of stages; 2 stops before the motion model, which is HuMoR's VPoser-t.
         advanced: called after each stage.
     """
     model.requires_grad_(False)
@@ -137,7 +137,7 @@ def fit_window(
 
 
 class _Stage(NamedTuple):
-    """Which variables are free, under which terms, for how many steps at most."""
+    """Free variables, terms, and largest number of steps of a stage."""
 
     free: tuple[str, ...]
     terms: list[Term]
@@ -145,7 +145,7 @@ class _Stage(NamedTuple):
 
 
 def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[_Stage]:
-    """The root's pose; all poses, by smoothness; all poses and latents, by the model of motion."""
+    """Return the stages: the root's pose; all poses with smoothness; all poses and latents with the motion model."""
     shape: list[Term] = [Bones(settings.bones_sigma)]
     body: tuple[str, ...] = (*POSES, "bones")
     if not start.ground_known:
@@ -170,11 +170,11 @@ def minimise(
     """Minimise the energy by L-BFGS.
 
     Args:
-        model: of transitions.
-        variables: to start from.
-        names: of the variables that are free; the others stay.
-        terms: of the energy.
-        steps: at most.
+        model: the transition model.
+        variables: initial variables.
+        names: names of the free variables; the others are fixed.
+        terms: terms of the energy.
+        steps: largest number of steps.
 
     Returns:
         The variables of least energy, and that energy, nats.
@@ -213,10 +213,10 @@ def minimise(
 
 @cache
 def preconditioner(frames: int) -> Tensor:
-    """(T, T) of the poses' moves: the inverse root of 1 + `STIFFNESS` times the squared second differences.
+    """(T, T) preconditioner of the poses: the inverse square root of 1 + `STIFFNESS` times squared second differences.
 
-    Observations constrain each frame by itself, motion terms constrain three by their acceleration, and far more
-    firmly: the energy is ill-conditioned. Through this matrix L-BFGS takes a fraction of the steps.
+    Observations constrain each frame separately. Motion terms constrain accelerations over three frames, far more
+    strongly, so the energy is ill-conditioned. With this matrix, L-BFGS needs a fraction of the steps.
     """
     second = torch.eye(frames, dtype=torch.float64).diff(n=2, dim=0)
     values, vectors = torch.linalg.eigh(torch.eye(frames) + STIFFNESS * (second.mT @ second))

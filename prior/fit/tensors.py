@@ -1,4 +1,4 @@
-"""What torch needs of the live code: kinematics and rotations with gradients, and networks loaded from weights."""
+"""Torch versions of the live code: kinematics and rotations with gradients, and networks loaded from weights."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from steadypose.prior.models.weights import load_weights
 
 
 def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Joint positions from local rotations and a person's bones.
+    """Compute joint positions from local rotations and a person's bones.
 
     Args:
         rotations: (..., 22, 3, 3) local rotation matrices.
         offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
-        root: (..., 3) metres, position of the pelvis; the origin if left out.
+        root: (..., 3) metres, position of the pelvis; the origin if omitted.
 
     Returns:
-        positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
+        Positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
     """
     batch = rotations.shape[:-3]
     offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
     origin = rotations.new_zeros(*batch, 3) if root is None else root
-    # Lists, not one tensor written in place: autograd needs every level's values kept.
+    # lists instead of one tensor written in place, because autograd needs every level's values
     positions: list[Tensor] = [origin.unsqueeze(-2)]
     orientations: list[Tensor] = [rotations[..., :1, :, :]]
     for above, level in pairwise(LEVELS):
@@ -41,12 +41,12 @@ def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None =
 
 
 def to_6d(rotations: Tensor) -> Tensor:
-    """(..., 3, 3) rotation matrices to (..., 6): first column, then second."""
+    """Convert rotation matrices (..., 3, 3) to (..., 6): first column, then second."""
     return rotations[..., :2].transpose(-1, -2).flatten(-2)
 
 
 def from_6d(x: Tensor) -> Tensor:
-    """(..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
+    """Convert (..., 6) to rotation matrices (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
     a, b = x[..., :3], x[..., 3:]
     first = F.normalize(a, dim=-1)
     second = F.normalize(b - (first * b).sum(dim=-1, keepdim=True) * first, dim=-1)
@@ -58,7 +58,7 @@ def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
 
     Args:
         rotations: (B, T, 22, 3, 3) local, z up.
-        frame: which frame of the window defines the heading.
+        frame: the frame of the window that defines the heading.
 
     Returns:
         The turned rotations, and the yaw matrices (B, 3, 3) that turn them back.
@@ -70,7 +70,7 @@ def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
 
 
 def heading(root_rotation: Tensor) -> Tensor:
-    """Yaw (...) in radians of root rotations (..., 3, 3): `prior.body.kinematics.heading`, in torch."""
+    """Yaw (...) in radians of root rotations (..., 3, 3), as `prior.body.kinematics.heading`, in torch."""
     left = root_rotation[..., :, 1]
     return torch.atan2(-left[..., 0], left[..., 1])
 
@@ -87,7 +87,7 @@ N = TypeVar("N", bound=nn.Module)
 
 
 def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """As `weights_io.load_weights`: the state dict and the configuration of ``model``."""
+    """Load the state dict and the configuration of ``model``, like `prior.models.weights.load_weights`."""
     weights, config = load_weights(name, model)
     return {key: torch.from_numpy(array) for key, array in weights.items()}, config
 
@@ -95,17 +95,17 @@ def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
 def load_network(
     network: Callable[[Config], N], config: Callable[[dict[str, Any]], Config], name: str, model: str
 ) -> N:
-    """A trained network, in evaluation.
+    """Load a trained network, in evaluation mode.
 
     Args:
         network: its class, such as `HGVAE`.
-        config: what makes that class's configuration of the JSON of a weights file, such as `HGVAEConfig.from_dict`.
+        config: function from a weights file's JSON to the class's configuration, such as `HGVAEConfig.from_dict`.
         name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
         model: the model's name, such as ``hgvae``.
 
     Raises:
-        FileNotFoundError: no such weights; says which there are.
-        WeightsError: the file is not one of this model's.
+        FileNotFoundError: there are no such weights; the message lists those that exist.
+        WeightsError: the file belongs to another model.
     """
     state, stored = load_tensors(name, model)
     loaded = network(config(stored))

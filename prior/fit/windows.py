@@ -1,4 +1,4 @@
-"""Recordings of any length, in windows that overlap: one after the other, each stored as soon as it is done."""
+"""Fits recordings of any length in overlapping windows, one after the other, each stored as soon as it is finished."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from steadypose.prior.fit.observations import Observed
 from steadypose.prior.fit.solve import FitSettings, Fitted, Start, fit_window
 
 FRAMES, OVERLAP = 90, 15
-"""Of a window, as in the paper; and how many of them the next one begins with."""
+"""Length of a window, as in the paper, and overlap with the next window, frames."""
 
 LYING = 0.5
-"""Cosine of the pelvis' tilt, below which a body lies."""
+"""Cosine of the pelvis' tilt below which a body lies."""
 
 MIN_FRAMES = 8
-"""The shortest track that is fitted."""
+"""Length of the shortest track that is fitted, frames."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Track:
     """One body at 30 Hz, T frames without a gap.
 
     Attributes:
-        starts: initial poses; of several, each window keeps the fit of least energy.
+        starts: initial poses; if there are several, each window keeps the fit of least energy.
         observed: observations of all T frames.
     """
 
@@ -55,10 +55,10 @@ class FittedTrack:
     Attributes:
         joints: (T, 22, 3) metres, world.
         rotations: (T, 22, 3, 3) local; the root's to the world.
-        offsets: (W, 22, 3) metres, the bones that each of W windows ended with.
-        ground: (W, 3) metres of height, and radians of tilt about x and y, of each.
-        load: (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN from a model that does not say.
-        misfit: (K, T, 22) as of `Observed.misfit`, of each of K observations.
+        offsets: (W, 22, 3) metres, the fitted bones of each of W windows.
+        ground: (W, 3) the ground of each window: height, metres, and tilts about x and y, radians.
+        load: (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them.
+        misfit: (K, T, 22) `Observed.misfit` of each of K observations.
         energies: (W, S) nats after each stage.
     """
 
@@ -72,7 +72,7 @@ class FittedTrack:
 
 
 def window_bounds(frames: int) -> list[tuple[int, int]]:
-    """First frame and end, exclusive, of each window; the last is as long as the others and overlaps by more."""
+    """Return first frame and end (exclusive) of each window; the last is as long as the others and overlaps more."""
     if frames <= FRAMES:
         return [(0, frames)]
     firsts = [*range(0, frames - FRAMES, FRAMES - OVERLAP), frames - FRAMES]
@@ -91,11 +91,11 @@ def fit_track(
     """Fit all windows of a track.
 
     Args:
-        model: of transitions.
+        model: the transition model.
         track: starts and observations.
-        settings: of each window's fit.
-        folder: cache of fitted windows, by a digest of all that a fit depends on.
-        stages: as of `fit_window`.
+        settings: settings of each window's fit.
+        folder: cache of fitted windows, keyed by a digest of everything that a fit depends on.
+        stages: as in `fit_window`.
         advanced: called after each window.
     """
     done: list[dict[str, Floats]] = []
@@ -127,7 +127,7 @@ def _between(start: Start, first: int, last: int) -> Start:
 
 
 def _grounded(start: Start) -> Start:
-    """The same, with a floor that is certain if the body ever lies: such poses are too unlikely to move it by."""
+    """Make the floor certain if the body ever lies, because such unlikely poses would displace it."""
     return replace(start, ground_known=start.ground_known or float(start.rotations[:, 0, 2, 2].min()) < LYING)
 
 
@@ -149,7 +149,7 @@ def _arrays(fitted: Fitted, seen: Sequence[Observed]) -> dict[str, Floats]:
 
 @torch.no_grad()
 def load_of(motion: Motion) -> Floats:
-    """(T, 8) probabilities of load; the first two frames, which no step ends in, have those of the third."""
+    """(T, 8) probabilities of load. The first two frames, in which no step ends, have those of the third."""
     logits = motion.predicted[1][:, : len(CONTACT_JOINTS)]
     if not logits.shape[1]:
         return np.full((len(motion.joints), len(CONTACT_JOINTS)), np.nan)
@@ -161,7 +161,7 @@ def _numpy(values: Tensor) -> Floats:
 
 
 def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]) -> FittedTrack:
-    """One motion of all windows, cross-faded where two overlap."""
+    """Join all windows to one motion, cross-faded where two overlap."""
     whole = {name: values for name, values in done[0].items() if name in ("joints", "rotations", "load", "misfit")}
     for (_, end), (first, _), found in zip(bounds, bounds[1:], done[1:], strict=False):
         shared = end - first
@@ -180,7 +180,7 @@ def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]
 
 
 def _slerp(first: Floats, second: Floats, share: Floats) -> Floats:
-    """Rotations (F, 22, 3, 3) from the first to the second by ``share`` (F,) of the way."""
+    """Interpolate rotations (F, 22, 3, 3) from the first to the second by ``share`` (F,)."""
     a = Rotation.from_matrix(first.reshape(-1, 3, 3))
     turn = (a.inv() * Rotation.from_matrix(second.reshape(-1, 3, 3))).as_rotvec()
     part = np.repeat(share, first.shape[1])[:, None] * turn
@@ -204,7 +204,7 @@ def _store(path: Path | None, found: dict[str, Any]) -> None:
 
 
 def _fingerprint(model: HumorNet, *inputs: Any) -> str:
-    """Digest of all that a window's fit depends on."""
+    """Digest of everything that a window's fit depends on."""
     digest = hashlib.sha256()
     for value in (*model.state_dict().values(), *inputs):
         _update(digest, value)
