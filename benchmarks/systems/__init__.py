@@ -1,4 +1,5 @@
-"""Studies of the system at work, one module each, as in `benchmarks.studies`. They want a machine of their own."""
+"""Studies of the running system, one module each, as in `benchmarks.studies`. Run them on a machine without other
+load."""
 
 from __future__ import annotations
 
@@ -9,4 +10,4 @@ SYSTEMS: dict[str, str] = {
     "soak": "faults into nodes at work for an hour, and what became of each frame",
     "events": "events of simulated people",
 }
-"""Module in this package: what it measures."""
+"""Description of what each module of this package measures."""

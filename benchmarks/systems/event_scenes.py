@@ -1,8 +1,9 @@
-"""Simulated scenes in which people do what `prior.events` tells, with the truth of when.
+"""Simulated scenes in which people do what `prior.events` detects, with true onsets.
 
-Onsets are of the true motion, which no noise touches, by measures of their own where there are such: the script's
-times for waving and pointing, the pelvis' height for sitting, standing and lying, the camera's view for coming and
-going."""
+Onsets are computed from the true motion without noise, by measures independent of the detector where possible: the
+script's times for waving and pointing, the pelvis' height for sitting, standing and lying, the camera's view for
+entering and leaving.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +28,15 @@ from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
 
 DOUBT = 0.05
-"""metres, or radians, beyond a threshold, up to which it need not be told that it was crossed"""
+"""Margin beyond a threshold within which detection is optional, metres or radians."""
 SHORTEST_S = 0.25
-"""what lasts less need not be told, and may be"""
+"""Shortest duration that must be detected, seconds; shorter events are optional."""
 GRAVITY = 9.81
 LEG = [J[f"left_{joint}"] for joint in ("hip", "knee", "ankle", "foot")]
 
 
 class Label(NamedTuple):
-    """Something that one person does."""
+    """An event of one person."""
 
     person: int
     kind: EventKind
@@ -43,22 +44,22 @@ class Label(NamedTuple):
     start_s: float
     end_s: float
     required: bool = True
-    """whether it has to be told; if not, as between a threshold and its margin, it may be"""
+    """Whether it must be detected. If not, as between a threshold and its margin, detection is optional."""
     nearly_s: float = math.inf
-    """from when it may be told already, if that is before its start"""
+    """Earliest time at which it may be detected, if before its start."""
 
 
 class Scene(NamedTuple):
-    """Motions of all people, and what they do."""
+    """Motions of all people, and their events."""
 
     motions: list[Motion]
     labels: list[Label]
     undecided: frozenset[EventKind] = frozenset()
-    """kinds that the scene says nothing of: what looks like them may be told or not"""
+    """Kinds that the scene does not decide; detections of them do not count."""
 
 
 def gestures(rng: np.random.Generator) -> Scene:
-    """Stand before the camera, and raise hands, wave and point, one after the other, either arm."""
+    """Stand before the camera and raise hands, wave and point, one after the other, with either arm."""
     acts = rng.permutation([(act, side) for act in ("raise", "wave", "point") for side in ("left", "right")])
     ground = plan((rng.uniform(2.2, 3.0), rng.uniform(-0.3, 0.3)), np.pi + rng.uniform(-0.4, 0.4), [Stand(28.0)])
     intent, labels = Intent(ground), []
@@ -84,7 +85,7 @@ def gestures(rng: np.random.Generator) -> Scene:
 
 
 def _goal(rng: np.random.Generator, act: str, sign: float) -> Floats:
-    """Where the wrist goes, from the shoulder, in arm lengths: forward, left, up."""
+    """Return the wrist's goal relative to the shoulder, in arm lengths: forward, left, up."""
     if act == "raise":
         return np.array([rng.uniform(0.1, 0.4), sign * rng.uniform(0.1, 0.4), rng.uniform(0.55, 0.85)])
     if act == "wave":
@@ -94,7 +95,7 @@ def _goal(rng: np.random.Generator, act: str, sign: float) -> Floats:
 
 
 def comes_and_goes(rng: np.random.Generator) -> Scene:
-    """Walk into view, up to the camera, stand, turn, and leave."""
+    """Walk into view and up to the camera, stand, turn, and leave."""
     side = rng.choice([-1.0, 1.0])
     parts: list[Stand | Walk | Turn] = [
         Stand(0.5), Walk([(2.4, 0.6 * side), (1.0, rng.uniform(-0.1, 0.1))], rng.uniform(0.9, 1.3)),
@@ -106,17 +107,18 @@ def comes_and_goes(rng: np.random.Generator) -> Scene:
 
 
 def falls(rng: np.random.Generator) -> Scene:
-    """Stand, then topple over like a pole, to any side, and stay there."""
+    """Stand, then topple over like a pole, to any side, and stay on the floor."""
     return _tips(rng, _toppling)
 
 
 def lies_down(rng: np.random.Generator) -> Scene:
-    """Stand, then lie down slowly, and stay there."""
+    """Stand, then lie down slowly, and stay on the floor."""
     return _tips(rng, lambda t: 0.5 * np.pi * minimum_jerk(t / 5.0))
 
 
 def _toppling(t: Floats) -> Floats:
-    """(T,) radians from upright of a pole of 1.2 m that topples: theta'' = 3 g sin(theta) / 2 l, up to the floor."""
+    """Return the tilt (T,) from upright of a toppling pole of 1.2 m, radians: theta'' = 3 g sin(theta) / 2 l, up to the
+    floor."""
     angle, speed, angles = 0.1, 0.0, []
     for moment in t:
         if moment > 0:
@@ -127,7 +129,7 @@ def _toppling(t: Floats) -> Floats:
 
 
 def _tips(rng: np.random.Generator, tilt: Callable[[Floats], Floats]) -> Scene:
-    """Stand, then tip over as a whole about the feet, by ``tilt`` radians from a moment on."""
+    """Stand, then tip over as a whole about the feet, by ``tilt`` radians over time."""
     standing = perform(Intent(plan((2.8, 0.0), rng.uniform(-np.pi, np.pi), [Stand(12.0)])), _person(rng), rng)
     began, toward = rng.uniform(2.5, 4.0), rng.uniform(-np.pi, np.pi)
     angle = tilt(standing.times - began)
@@ -157,7 +159,7 @@ def _of_script(name: str, *undecided: EventKind) -> Callable[[np.random.Generato
 
 
 def sits(rng: np.random.Generator) -> Scene:
-    """Sit down on a chair twice, and rise."""
+    """Sit down on a chair twice, and stand up again."""
     (motion,) = SCRIPTS["sit_rise"](rng)
     labels = [label for label in common(0, motion) if label.kind != EventKind.STANDS]
     return Scene([motion], [*labels, *seated(0, motion)])
@@ -171,7 +173,7 @@ SCENES: Mapping[str, Callable[[np.random.Generator], Scene]] = {
     "lies down": lies_down,
     "walks": _of_script("walk_turn"),
     "idles": _of_script("idle"),
-    # a hand held out at a shelf, or raised to one behind the back's hiding arm: who is to say that it does not point?
+    # a hand held out at a shelf, or raised and hidden by the back, may or may not be pointing
     "reaches": _of_script("reach", EventKind.POINTS, EventKind.HAND_RAISED),
     "two cross": _of_script("crossing"),
 }
@@ -182,7 +184,7 @@ def _person(rng: np.random.Generator) -> Floats:
 
 
 def common(person: int, motion: Motion) -> list[Label]:
-    """What the true joints of any scene tell: near, facing the camera, upright, hands above the neck."""
+    """Label from the true joints of any scene: near, facing the camera, upright, hands above the neck."""
     s, p, t = EventSettings(), motion.positions, motion.times
     left = p[:, J["left_hip"]] - p[:, J["right_hip"]] + p[:, J["left_shoulder"]] - p[:, J["right_shoulder"]]
     facing = np.arctan2(-left[:, 0], left[:, 1])
@@ -215,7 +217,7 @@ def common(person: int, motion: Motion) -> list[Label]:
 
 
 def seated(person: int, motion: Motion) -> Iterator[Label]:
-    """Of one who sits down on a chair and rises: when the pelvis is down, or up."""
+    """Label sitting down and standing up from the pelvis' height."""
     height = motion.root[:, 2]
     low, high = float(height.min()), float(np.quantile(height, 0.9))
     down, middle, up = low + 0.15 * (high - low), 0.5 * (low + high), high - 0.2 * (high - low)
@@ -224,7 +226,7 @@ def seated(person: int, motion: Motion) -> Iterator[Label]:
 
 
 def lying(person: int, motion: Motion) -> Iterator[Label]:
-    """When all of head, trunk, knees and feet are low."""
+    """Label lying: head, trunk, knees and feet are all low."""
     s, heights = EventSettings(), motion.positions[:, EXTENT, 2]
     extent = heights.max(axis=1) - heights.min(axis=1)
     yield from _while(
@@ -235,7 +237,7 @@ def lying(person: int, motion: Motion) -> Iterator[Label]:
 def _while(
     person: int, kind: EventKind, hand: Hand, t: Floats, holds: NDArray[np.bool_], nearly: NDArray[np.bool_]
 ) -> Iterator[Label]:
-    """A label for each time that it nearly holds: required from where it holds, if it ever does."""
+    """Yield a label for each time that it nearly holds, required from where it holds, if it ever does."""
     for begin, end in runs(nearly):
         held = np.flatnonzero(holds[begin:end])
         start = begin + int(held[0]) if len(held) else begin
@@ -243,12 +245,13 @@ def _while(
 
 
 def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bool_]) -> Iterator[Label]:
-    """The labels of a person as far as a camera can tell them: who comes into view has entered, and what they do then
-    begins then.
+    """Yield a person's labels as far as a camera can observe them.
+
+    A person enters when they come into view. What they do at that moment begins then.
 
     Args:
-        labels: of all people.
-        person: whose are wanted.
+        labels: labels of all people.
+        person: the person.
         t: (T,) seconds.
         seen: (T,) whether most of the person is in the camera's view.
     """
@@ -264,20 +267,20 @@ def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bo
 
 
 def runs(holds: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and one past the last index of each time that it holds."""
+    """Return the first and one past the last index of each run in which it holds."""
     edges = np.diff(np.concatenate([[0], holds.astype(int), [0]]))
     return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
 MOMENTS = (EventKind.ENTERED, EventKind.LEFT)
-"""which last no time"""
+"""Kinds without a duration."""
 EARLY_S, LATE_S = 0.5, 1.0
-"""how long before and after its onset a beginning meets a label"""
+"""How long before and after its true onset a detection matches a label, seconds."""
 
 
 @dataclass
 class Score:
-    """Of one kind."""
+    """Score of one kind."""
 
     met: int = 0
     missed: int = 0
@@ -304,7 +307,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Told:
-    """A beginning that was told."""
+    """A detected beginning of an event."""
 
     person: int
     kind: EventKind
@@ -313,7 +316,7 @@ class Told:
 
 
 def score(told: Sequence[Told], labels: Sequence[Label], undecided: Iterable[EventKind] = ()) -> dict[EventKind, Score]:
-    """Scores by kind; kinds that are ``undecided`` have none."""
+    """Score detections by kind; ``undecided`` kinds have no score."""
     scores: dict[EventKind, Score] = defaultdict(Score)
     left = [t for t in told if t.kind not in undecided]
     for label in sorted(labels, key=lambda label: (not label.required, label.start_s)):

@@ -1,7 +1,7 @@
-"""How well `prior.events` tells what people do: precision, recall and delay, behind the whole pipeline.
+"""Precision, recall and delay of `prior.events`, after the whole pipeline.
 
-Simulated people are filmed with a Kinect's errors, and go through the nodes' own pipelines; `event_mocap` does the same
-with motion capture. The thresholds were chosen on other seeds and people.
+Simulated people are observed with a Kinect's errors and processed by the nodes' own pipelines; `event_mocap` does the
+same with motion capture. The thresholds were chosen on other seeds and people.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ DELAYS = (
     "every pose, comes on top."
 )
 IN_VIEW = 0.5
-"""share of a body's joints in the camera's view, from which on it is there"""
+"""Least share of a body's joints in the camera's view for the body to count as present."""
 
 
 def worlds_of(raw: Iterable[PoseRaw]) -> Iterator[PoseClean | PoseWorld]:
-    """What the prior and the trajectory node give for a stream."""
+    """Yield what the prior and the trajectory node publish for a stream."""
     for _, message in stream(((POSE_RAW, frame) for frame in raw), make_prior({}), make_trajectory({})):
         if isinstance(message, PoseClean | PoseWorld):
             yield message
 
 
 def labels_of(scene: Scene) -> list[Label]:
-    """The labels of a scene as far as the camera sees their people."""
+    """Return the labels of a scene as far as its people are in the camera's view."""
     times = scene.motions[0].times
     t = np.arange(0.0, times[-1], 1.0 / GRID_HZ)
     labels = []
@@ -58,7 +58,7 @@ def labels_of(scene: Scene) -> list[Label]:
 
 
 def told_of(messages: Iterable[PoseClean | PoseWorld], scene: Scene, settings: EventSettings) -> list[Told]:
-    """The beginnings that are told of a stream; a body is the person that it is nearest to when it is told of."""
+    """Return the detected beginnings of events in a stream. A body is the person it is nearest to at that time."""
     events, told, last = EventStream(settings), [], {}
     times = scene.motions[0].times
     for message in messages:
@@ -77,25 +77,25 @@ def told_of(messages: Iterable[PoseClean | PoseWorld], scene: Scene, settings: E
 
 
 def simulated(name: str, seed: int) -> tuple[Scene, list[PoseRaw]]:
-    """A scene, and what a camera makes of it."""
+    """Return a scene and what a camera observes of it."""
     playing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
     scene = SCENES[name](playing)
     return scene, film(scene.motions, CAMERA, NoiseModel.load(KINECT_NOISE), filming, name, START_NS)
 
 
 def scored(raw: Iterable[PoseRaw], scene: Scene) -> dict[EventKind, Score]:
-    """What is told of a stream against the labels of its scene."""
+    """Score the detections in a stream against the labels of its scene."""
     return score(told_of(worlds_of(raw), scene, EventSettings()), labels_of(scene), scene.undecided)
 
 
 def record_of(kind: EventKind, found: Score) -> dict[str, Any]:
-    """For the results file."""
+    """Return a record for the results file."""
     counts = {"met": found.met, "missed": found.missed, "false": found.false}
     return {"kind": kind.name, **counts, "delays_s": found.delays_s}
 
 
 def run(bench: Bench) -> Result:
-    """Events of simulated people; seeds from 100 on chose the thresholds."""
+    """Score events of simulated people. Seeds from 100 on chose the thresholds."""
     totals: dict[EventKind, Score] = defaultdict(Score)
     by_scene: list[dict[str, Any]] = []
     runs = [(name, seed) for name in SCENES for seed in bench.seeds]
@@ -109,7 +109,7 @@ def run(bench: Bench) -> Result:
 
 
 def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str) -> Table:
-    """A row for each kind, and one for all."""
+    """Build a table with a row for each kind and one for all."""
     whole = Score()
     for found in totals.values():
         whole.add(found)

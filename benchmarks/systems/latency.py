@@ -1,8 +1,8 @@
 """Latency: computing time per frame, time from capture to ``pose/world``, and frames dropped.
 
-The input is a recorded stream, set to exactly 30 Hz and played to and fro so that nobody jumps; a crowd is copies of
-its body, side by side. Compute is measured in this process, pinned to one core, one thread. The rest is measured on
-the node processes themselves, from outside: a subscriber here notes when each message arrives.
+The input is a recorded stream at exactly 30 Hz, played forwards and backwards so that nobody jumps. A crowd is copies
+of its body, side by side. Computing time is measured in this process, pinned to one core, with one thread. The rest is
+measured from outside: this process subscribes to the node processes and notes when each message arrives.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ RECORDING = ROOT / "sim_data" / "walk_turn"
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 2, 4, 8, 16, 32)
 LATEST_MS = 150.0
-"""limit: 99 of 100 poses of the newest frame are no later, whatever the load"""
+"""Largest 99th percentile of the latency of a pose of the newest frame, milliseconds, whatever the load."""
 SPACING = 0.8
-"""metres between the copies of a body"""
+"""Distance between the copies of a body, metres."""
 WARM_UP, WARM_UP_S = 60, 5.0
-"""Frames before times count, and seconds of nodes at work: the first ones load code, and fill the window."""
+"""Frames, and seconds of live nodes, before times count. The first ones load code and fill the window."""
 
 
 def crowd(frames: list[PoseRaw], bodies: int) -> Iterator[PoseRaw]:
-    """An endless stream at exactly 30 Hz of copies of a recording's first body, side by side."""
+    """Yield an endless stream at exactly 30 Hz of copies of a recording's first body, side by side."""
     seen = [frame for frame in frames if frame.bodies]
     if len(seen) < 2:
         raise ValueError(f"expected a recording with at least 2 frames that show a body, got {len(seen)}")
@@ -61,7 +61,8 @@ def crowd(frames: list[PoseRaw], bodies: int) -> Iterator[PoseRaw]:
 
 
 def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[..., Iterable[int]]) -> dict[str, Any]:
-    """Milliseconds a frame of the prior, and of the trajectory on its answer: wall time and processor time."""
+    """Measure milliseconds per frame of the prior, and of the trajectory on its output: wall time and processor
+    time."""
     prior, trajectory = PriorPipeline(PriorSettings()), TrajectoryPipeline(TrajectorySettings())
     spent: dict[str, list[tuple[float, float]]] = {"prior": [], "trajectory": []}
     stream = crowd(frames, bodies)
@@ -91,7 +92,8 @@ def compute(frames: list[PoseRaw], bodies: int, count: int, track: Callable[...,
 
 
 def live(recording: Path, seconds: float, bench: Bench, title: str) -> dict[str, Any]:
-    """Milliseconds from capture to arrival of ``pose/world``, less the delay, in nodes that drop what is late."""
+    """Measure milliseconds from capture to arrival of ``pose/world``, minus the delay, in nodes that drop late
+    frames."""
     delay_ns = PriorSettings().delay * FRAME_NS
     timeline: Timeline | None = None
     late_ms: list[float] = []
@@ -150,14 +152,14 @@ def _now() -> tuple[float, float]:
 
 
 def percentiles(values: ArrayLike) -> dict[str, float]:
-    """p50, p95, p99 and the greatest."""
+    """Return p50, p95, p99 and the maximum."""
     values = np.asarray(values, dtype=np.float64)
     figures = dict(zip(("p50", "p95", "p99"), np.percentile(values, (50, 95, 99)).tolist(), strict=True))
     return {name: round(value, 3) for name, value in (figures | {"max": float(values.max())}).items()}
 
 
 def run(bench: Bench) -> Result:
-    """Compute, latency and drops of the nodes, on this machine."""
+    """Measure computing time, latency and drops of the nodes on this machine."""
     seconds = 10.0 if bench.quick else 60.0
     frames = recorded()
     with tempfile.TemporaryDirectory() as folder:
@@ -166,7 +168,7 @@ def run(bench: Bench) -> Result:
         for bodies in LIVE_CROWDS:
             path = Path(folder) / f"crowd_{bodies}"
             with RecordingWriter(path) as writer:
-                # what the nodes need to come up is played to nobody
+                # frames played while the nodes start are not counted
                 for raw in islice(crowd(frames, bodies), round((seconds + WARM_UP_S + START_S) * 30)):
                     writer.write(POSE_RAW, raw, raw.stamp_ns)
             lived.append({"bodies": bodies} | live(path, seconds, bench, f"live, {bodies} bodies"))
@@ -177,7 +179,7 @@ def run(bench: Bench) -> Result:
 
 
 def recorded() -> list[PoseRaw]:
-    """The frames of the stream that is played."""
+    """Return the frames of the stream that is played."""
     with RecordingReader(RECORDING) as reader:
         return [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
 
@@ -206,7 +208,7 @@ def _compute_table(results: list[dict[str, Any]], numpy: float) -> Table:
 
 
 def carried(results: list[dict[str, Any]]) -> int:
-    """The most bodies that are all answered in 99 of 100 frames; 0 if not even one is."""
+    """Return the largest number of bodies that are all processed in 99 of 100 frames; 0 if not even one is."""
     in_full = (
         r["bodies"] for r in results if r["bodies_answered"] * r["arrived"] >= 0.99 * r["bodies"] * r["expected"]
     )

@@ -1,5 +1,7 @@
-"""How long poses are missing at the start, and after a node was killed, as who subscribes to ``pose/world`` sees it: on
-a machine that has nothing else to do, and on one whose processors are all busy."""
+"""How long ``pose/world`` is missing at the start and after a node is killed, as a subscriber sees it.
+
+Measured on an idle machine and on one whose processors are all busy.
+"""
 
 from __future__ import annotations
 
@@ -32,27 +34,29 @@ DEPENDS_ON = WORLD
 
 RECORDING = ROOT / "sim_data" / "walk_turn"
 KILLS = 20
-"""Times that each node is killed, and all are started."""
+"""Number of times that each node is killed, and that all nodes are started."""
 PAUSE_S = STEADY_S / len(POSE_NODES) + 1.0
-"""Between kills of different nodes: each is up for longer than `STEADY_S`, so that none is started with a pause."""
+"""Time between kills of different nodes, seconds. Each node runs for longer than `STEADY_S`, so none is restarted with
+a pause."""
 AT_ONCE_S = 0.5
-"""After a kill, in which its gap begins; one that begins later is the pause between two times of a recording."""
+"""Time after a kill within which its gap begins, seconds. A later gap is the pause between two passes of a
+recording."""
 ALL = "all, started"
 FIRST = "all, started for the first time"
 FIRST_S = 600.0
-"""what loops get to be compiled"""
+"""Time allowed for compiling the loops, seconds."""
 BUSY = ", processors busy"
 
 
 def first_start(recording: Path) -> float:
-    """Seconds from ``steadypose run`` to the first ``pose/world``, with loops that were never compiled."""
+    """Return the seconds from ``steadypose run`` to the first ``pose/world``, with loops that were never compiled."""
     with tempfile.TemporaryDirectory() as folder:
         return _start(recording, {"NUMBA_CACHE_DIR": folder}, FIRST_S)
 
 
 @contextmanager
 def busy() -> Iterator[None]:
-    """Every processor has something else to do."""
+    """Keep every processor busy."""
     spin = [sys.executable, "-c", "while True: pass"]
     others = [subprocess.Popen(spin) for _ in range(os.cpu_count() or 1)]
     try:
@@ -83,7 +87,7 @@ def _start(recording: Path, environment: Mapping[str, str] = MappingProxyType({}
 
 
 def restarts(recording: Path, kills: int, progress: Progress) -> dict[str, list[float]]:
-    """Seconds without ``pose/world`` after each kill of each node."""
+    """Return the seconds without ``pose/world`` after each kill of each node."""
     found: dict[str, list[float]] = {name: [] for name in POSE_NODES}
     bar = progress.add_task("kills", total=kills * len(POSE_NODES))
     with running(recording, lossless=False, loop=True) as nodes:
@@ -98,7 +102,7 @@ def restarts(recording: Path, kills: int, progress: Progress) -> dict[str, list[
 
 
 def _arrivals(nodes: Running, span_s: float) -> list[float]:
-    """When each ``pose/world`` arrives, monotonic seconds, for ``span_s`` and until one has arrived since."""
+    """Return the arrival times of ``pose/world``, monotonic seconds, for ``span_s`` and until one has arrived since."""
     until, arrived = time.monotonic() + span_s, []
     for topic, _ in nodes.messages:
         if topic == POSE_WORLD:
@@ -109,13 +113,13 @@ def _arrivals(nodes: Running, span_s: float) -> list[float]:
 
 
 def longest_gap(times: Sequence[float], until_s: float) -> float:
-    """The longest time between two of these moments in a row, of which the first is among the first ``until_s``."""
+    """Return the longest time between two consecutive moments, the first of which is among the first ``until_s``."""
     moments = np.array(times)
     return round(float(np.diff(moments)[moments[:-1] <= moments[0] + until_s].max()), 3)
 
 
 def run(bench: Bench) -> Result:
-    """How soon the first pose is there, and each node back after SIGKILL, on this machine."""
+    """Measure the time to the first pose, and of each node's return after SIGKILL, on this machine."""
     number = 2 if bench.quick else KILLS
     starts = bench.progress.track(range(number), description="starts")
     found = {FIRST: [first_start(RECORDING)], ALL: [_start(RECORDING) for _ in starts]}

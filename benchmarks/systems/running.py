@@ -1,4 +1,4 @@
-"""The node processes at work, watched from outside."""
+"""Runs the node processes and observes them from outside."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import POSE_NODES
 
 START_S = 60.0
-"""what the nodes get to come up"""
+"""Time allowed for the nodes to start, seconds."""
 SILENCE_S = 30.0
-"""no message for so long is a node that hangs"""
+"""Time without a message after which a node counts as hung, seconds."""
 
 
 class Running(NamedTuple):
-    """Nodes at work.
+    """Running nodes.
 
     Attributes:
-        messages: what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it comes; ends when a node
-            fails, or all fall silent.
-        subscriber: where ``messages`` come from, for who does not want to wait for them.
-        supervisor: of their processes.
-        clock: theirs.
+        messages: what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it arrives; ends when a node
+            fails or all fall silent.
+        subscriber: source of ``messages``, for callers who do not want to wait for them.
+        supervisor: the supervisor of their processes.
+        clock: their clock.
         endpoints: where they publish.
     """
 
@@ -55,7 +55,7 @@ def running(
     record: Path | None = None,
     settings: Sequence[str] = (),
 ) -> Iterator[Running]:
-    """The node processes at work on a recording, with a recorder where there is a place to ``record`` to."""
+    """Run the node processes on a recording; with ``record``, also a recorder that writes there."""
     played = [
         f"input.recording={json.dumps(str(recording))}",
         f"input.rate={rate}",
@@ -63,7 +63,7 @@ def running(
         f"transport.lossless={json.dumps(lossless)}",
         *settings,
     ]
-    if record:  # as on a machine that runs for months: parts, of which the oldest go
+    if record:  # as on a machine that runs for months: recordings in parts, the oldest of which are deleted
         limits = {"directory": str(record), "split_mb": 50.0, "keep_mb": 200.0}
         played += [f"recorder.{name}={json.dumps(value)}" for name, value in limits.items()]
     with running_nodes([*POSE_NODES, "recorder"] if record else [*POSE_NODES], played) as nodes:
@@ -72,7 +72,7 @@ def running(
 
 @contextmanager
 def running_nodes(nodes: Sequence[str], settings: Sequence[str]) -> Iterator[Running]:
-    """The processes of these nodes, with these settings over those of ``launch/replay.toml``."""
+    """Run the processes of these nodes, with these settings over those of ``launch/replay.toml``."""
     console = Console(stderr=True)
     clock = SystemClock()
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:

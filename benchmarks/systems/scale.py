@@ -1,7 +1,7 @@
 """Throughput: streams per core of a server, and hours of recordings cleaned per hour.
 
-A server's clients are copies of one recorded body, each with a clock of its own and captured at another time of the
-frame's period. Times are the thread's processor time, which other processes of the machine do not lengthen.
+A server's clients are copies of one recorded body. Each has its own clock and is captured at another time of the frame
+period. Times are the thread's processor time, which other processes do not lengthen.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ DEPENDS_ON = WORLD
 CLIENTS = (1, 4, 8, 16)
 LIVE_CLIENTS = (1, 4, 8, 16, 32)
 NETWORK_NS = 3_000_000
-"""what a message travels"""
+"""Network latency of a message, nanoseconds."""
 PERIOD_MS = FRAME_NS / 1e6
 
 
 def serve(
     frames: list[PoseRaw], clients: int, hgvae: bool, periods: int, track: Callable[..., Iterable[int]]
 ) -> dict[str, Any]:
-    """Milliseconds of a 30 Hz period that the prior, and the trajectories, of so many clients take.
+    """Measure the milliseconds per 30 Hz period that the prior and the trajectories of these clients take.
 
     Args:
-        frames: what each client sees.
-        clients: how many.
+        frames: what each client observes.
+        clients: number of clients.
         hgvae: whether windows are scored and hidden joints imputed.
-        periods: to measure.
-        track: progress over a range.
+        periods: number of periods to measure.
+        track: shows progress over a range.
     """
     switched = {stage: {"enabled": hgvae} for stage in ("score", "impute")}
     prior = StreamBatch(PriorSettings.from_dict({"max_bodies": clients} | switched), clients)
@@ -65,7 +65,7 @@ def serve(
         cost = {"prior": 0.0, "trajectory": 0.0}
         for k, name in enumerate(names):
             captured_ns = raw.stamp_ns + round(k * FRAME_NS / clients)
-            # hours apart, as clocks that nobody set
+            # hours apart, as clocks that were never set
             message = dataclasses.replace(raw, source=name, stamp_ns=captured_ns + k * 3_600_000_000_000)
             started = time.thread_time()
             cleaned = prior.process_at(message, captured_ns + NETWORK_NS)
@@ -89,9 +89,9 @@ def serve(
 
 
 def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str, Any]:
-    """Milliseconds from capture to arrival of ``pose/world``, less the delay, of a server's nodes; and what is lost.
+    """Measure milliseconds from capture to arrival of ``pose/world``, minus the delay, of a server's nodes, and losses.
 
-    The clients are publishers of this process, one body each, at 30 Hz, captured one after the other within the period.
+    The clients are publishers in this process, one body each, at 30 Hz, captured one after the other within the period.
     """
     names = [f"client {k}" for k in range(clients)]
     stream = crowd(frames, 1)
@@ -118,7 +118,7 @@ def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str,
             for k, publisher in enumerate(publishers):
                 stamp_ns = began_ns + round((period + k / clients) * FRAME_NS)
                 nodes.clock.sleep(stamp_ns - nodes.clock.now_ns())
-                if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # else this process has no time to be a client
+                if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # otherwise this process is too slow to be a client
                     publisher.publish(POSE_RAW, dataclasses.replace(raw, source=names[k], stamp_ns=stamp_ns))
                     sent += period >= WARM_UP_S * FPS
             while received := nodes.subscriber.receive(0):
@@ -129,7 +129,7 @@ def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str,
 
 
 def clean_rate(recording: Path) -> dict[str, float]:
-    """Seconds of a recorded stream that one core cleans in a second."""
+    """Return the seconds of a recorded stream that one core cleans in a second."""
     with tempfile.TemporaryDirectory() as folder:
         settings: dict[str, dict[str, Any]] = {"prior": {}, "trajectory": {}}
         started = time.process_time()
@@ -139,7 +139,7 @@ def clean_rate(recording: Path) -> dict[str, float]:
 
 
 def run(bench: Bench) -> Result:
-    """Streams a core, and recordings cleaned an hour, on this machine."""
+    """Measure streams per core, and recordings cleaned per hour, on this machine."""
     periods = round((2.0 if bench.quick else 10.0) * 30)
     frames = recorded()[:600]
     served = [serve(frames, clients, on, periods, bench.progress.track) for clients in CLIENTS for on in (False, True)]
@@ -151,7 +151,7 @@ def run(bench: Bench) -> Result:
 
 
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
-    """The most clients measured that a node can serve on one core: 99 of 100 periods end in time."""
+    """Return the largest measured number of clients that a node serves on one core: 99 of 100 periods end in time."""
 
     def most(node: str, hgvae: bool) -> int:
         in_time = (s["clients"] for s in served if s["hgvae"] == hgvae and s[f"{node}_ms"]["p99"] < PERIOD_MS)

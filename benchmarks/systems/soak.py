@@ -1,8 +1,9 @@
-"""Faults, one after the other, into nodes at work: killed, stopped and hung, on a full disk, among malformed clients,
-with a sensor's clock that is set.
+"""Injects faults into running nodes, one after the other: kills, stops, hangs, a full disk, malformed clients, a
+sensor's clock that is set.
 
-Half of the time a replay that is to lose nothing, each time recorded and compared with one that nothing befell; half of
-the time a live stream, whose every frame must be counted as worked on or as dropped, for a cause.
+Half of the time nodes replay a recording that must lose nothing; each replay is recorded and compared with one without
+faults. Half of the time they process a live stream, whose every frame must be counted as processed or as dropped, with
+a cause.
 """
 
 from __future__ import annotations
@@ -47,23 +48,24 @@ from steadypose.prior.timing.rate import FPS
 DEPENDS_ON = WORLD
 
 MINUTES = 60.0
-"""Of both halves together; a replay is finished."""
+"""Duration of both halves together, minutes; the last replay is completed."""
 FRAMES = 1200
-"""Of a replay: 40 s."""
+"""Length of a replay, frames: 40 s."""
 BETWEEN_S = 6.0
-"""faults"""
+"""Time between faults, seconds."""
 BACK_S = 30.0
-"""limit: without poses after a fault"""
+"""Longest time without poses after a fault, seconds."""
 HUNG_S = 14.0
-"""for longer than a supervisor waits"""
+"""Duration of a hang, seconds; longer than a supervisor waits."""
 UNSAID = 40
-"""messages of a stream that a node works on between two reports: what it did since its last, a killed one never says"""
+"""Largest number of messages that a node processes between two reports. A killed node never reports those since its
+last."""
 DISK = "size=24m"
 POSES = (POSE_RAW, POSE_CLEAN, POSE_WORLD)
 CAUSES = {"in": "in.", "lost": "dropped.lost", "expired": "dropped.expired", "away": "dropped.away"}
-"""what becomes of a message, and how that is called in diagnostics"""
+"""What becomes of a message, and its name in diagnostics."""
 SAME_M = 1e-6
-"""metres; positions are float32"""
+"""Largest difference of equal positions, metres; positions are float32."""
 CLOCK_STEPS_S = (3600.0, -1800.0, 60.0, -60.0)
 GARBAGE = (
     b"GET / HTTP/1.1\r\n\r\n",
@@ -78,17 +80,17 @@ FOXGLOVE_OPEN = (
 )
 ROS_DOMAIN = 87
 ROS_PORTS = range(7400 + 250 * ROS_DOMAIN, 7400 + 250 * ROS_DOMAIN + 30)
-"""where RTPS of that domain is taken: discovery and data of its first participants"""
+"""Ports of RTPS in that domain: discovery and data of its first participants."""
 
 
 @dataclass
 class Replayed:
-    """What is different in replays with faults, of one topic, added up.
+    """Total differences of replays with faults, for one topic.
 
     Attributes:
-        lost, twice, deviating: frames.
-        furthest_m: of any joint.
-        longest_s: that frames in a row deviate.
+        lost, twice, deviating: numbers of frames.
+        furthest_m: largest deviation of a joint.
+        longest_s: longest run of deviating frames.
     """
 
     frames: int = 0
@@ -100,7 +102,7 @@ class Replayed:
 
 
 def run(bench: Bench) -> Result:
-    """Faults into nodes at work, and what comes of each frame; what is lost without a cause is wrong."""
+    """Inject faults into running nodes and account for each frame. A loss without a cause is an error."""
     random_, half_s = random.Random(bench.seeds[0]), 30.0 * (2.0 if bench.quick else MINUTES)
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
         replayed, kills = replays(Path(folder), half_s, random_)
@@ -115,7 +117,7 @@ def run(bench: Bench) -> Result:
 
 
 def replays(folder: Path, seconds: float, random_: random.Random) -> tuple[dict[str, Replayed], dict[str, int]]:
-    """Replays with kills and stops against one without; and how many of them there were."""
+    """Compare replays with kills and stops to one without; also return the number of faults."""
     frames = list(islice(crowd(recorded(), 1), FRAMES))
     _write(folder / "in", frames)
     expected = _played(folder)
@@ -131,8 +133,8 @@ def replays(folder: Path, seconds: float, random_: random.Random) -> tuple[dict[
 def _played(
     folder: Path, random_: random.Random | None = None, kills: dict[str, int] | None = None
 ) -> dict[str, dict[int, list[Any]]]:
-    """The positions that a replay recorded, by topic and number of the frame; with faults, counted in ``kills``, where
-    there is chance."""
+    """Return the positions that a replay recorded, by topic and frame number. With ``random_``, inject faults and count
+    them in ``kills``."""
     out = folder / "out"
     shutil.rmtree(out, ignore_errors=True)
     settings = _settings(folder / "in", out, lossless=True)
@@ -160,14 +162,14 @@ def _played(
         for topic, _, message in reader.messages(found):
             assert not isinstance(message, Diagnostics)
             if not message.end_of_stream:
-                # who begins anew has another first stamp, and a grid that is a nanosecond off
+                # a restarted node has another first stamp, and a grid that is off by a nanosecond
                 number = round((message.stamp_ns - reader.start_ns) / FRAME_NS)
                 found[topic][number].append([body.positions for body in message.bodies])  # type: ignore[union-attr]
     return found
 
 
 def _until_recorded(nodes: Running) -> None:
-    """Until the recorder has seen the end of the last stream, or for `BACK_S`."""
+    """Wait until the recorder has received the end of the last stream, at most `BACK_S`."""
     ends = time.monotonic() + BACK_S
     for _, message in nodes.messages:
         if time.monotonic() > ends:
@@ -198,10 +200,10 @@ def _compare(expected: dict[int, list[Any]], got: dict[int, list[Any]], found: R
 def live(
     folder: Path, seconds: float, random_: random.Random
 ) -> tuple[dict[str, list[float]], dict[str, dict[str, int]], list[str]]:
-    """A live stream with faults.
+    """Process a live stream with faults.
 
     Returns:
-        Seconds without poses after each fault; of each node what became of its frames; and what does not add up.
+        Seconds without poses after each fault; what became of each node's frames; and what does not add up.
     """
     _write(folder / "stepping", _stepping(list(islice(crowd(recorded(), 1), FRAMES))))
     gaps: dict[str, list[float]] = defaultdict(list)
@@ -210,7 +212,7 @@ def live(
     os.environ |= {"ROS_DOMAIN_ID": str(ROS_DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     with _small_disk(folder / "disk") as disk, _free_port() as port:
         settings = [*_settings(folder / "stepping", disk / "out", lossless=False), f"foxglove.port={port}"]
-        # faults take their time, while poses go on to be read
+        # poses are read while faults are injected
         with running_nodes(names, settings) as nodes, ThreadPoolExecutor(1) as another:
             ledger, reports = Ledger(Launch.read("replay", settings)), {}
             faults = _faults(nodes, disk, port, random_)
@@ -222,7 +224,7 @@ def live(
                     restarts = nodes.supervisor.children[message.node].restarts
                     reports[message.node] = ledger.note(message, restarts)
                 elif topic == POSE_WORLD:
-                    if fault and last_s:  # not for want of the first pose
+                    if fault and last_s:  # not while waiting for the first pose
                         gaps[fault][-1] = max(gaps[fault][-1], round(now - last_s, 3))
                     last_s = now
                 if pending.done():
@@ -268,7 +270,7 @@ def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> di
                     client.sendall(garbage)
 
     def disturb_foxglove() -> None:
-        """A client that is one, and then sends what none does."""
+        """Connect as a valid client, then send malformed data."""
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as client:
             client.sendall(FOXGLOVE_OPEN)
             client.recv(4096)
@@ -282,7 +284,7 @@ def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> di
             client.sendall(bytes([0xFF, 0xFF]) + b"\xff" * 12)
 
     def disturb_ros() -> None:
-        """Submessages of RTPS with lengths and kinds that are none."""
+        """Send RTPS submessages with invalid lengths and kinds."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
             for place in ROS_PORTS:
                 for _ in range(20):
@@ -311,12 +313,12 @@ def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> di
 def _accounts(
     ledger: Ledger, reports: dict[str, Diagnostics], restarts: dict[str, int]
 ) -> tuple[dict[str, dict[str, int]], list[str]]:
-    """Of each node: published for it, worked on, dropped by cause; and where that does not add up."""
+    """Return for each node: frames published for it, processed, dropped by cause; and where that does not add up."""
     counts: dict[str, dict[str, int]] = {}
     wrong = []
     for name, report in reports.items():
         if NODES[name].delivery is Delivery.BEST_EFFORT or not NODES[name].subscribes:
-            continue  # may miss anything; or is given nothing
+            continue  # may miss any message, or receives none
         values = {k: int(v) for k, v in report.values.items() if k.startswith((*LOSSES, "in."))}
         values |= {k: int(v) for k, v in ledger.away(name, reports).items()}
         streams = [
@@ -335,7 +337,7 @@ def _accounts(
 
 @contextmanager
 def _small_disk(folder: Path) -> Iterator[Path]:
-    """A file system of a few megabytes, if this user may mount one; else a folder."""
+    """Mount a file system of a few megabytes, if this user may; otherwise use a folder."""
     folder.mkdir()
     mounted = (
         not os.getuid()
@@ -367,7 +369,7 @@ def _settings(played: Path, out: Path, *, lossless: bool) -> list[str]:
 
 
 def _stepping(frames: Sequence[PoseRaw]) -> list[PoseRaw]:
-    """The frames of a sensor whose clock is set a few times, for good or for one frame."""
+    """Return the frames of a sensor whose clock is set a few times, permanently or for one frame."""
     stepped, shift_s, span = [], 0.0, len(frames) // (len(CLOCK_STEPS_S) + 1)
     for index, frame in enumerate(frames):
         if index and index % span == 0:
@@ -379,7 +381,7 @@ def _stepping(frames: Sequence[PoseRaw]) -> list[PoseRaw]:
 
 def _write(directory: Path, frames: Sequence[PoseRaw]) -> None:
     with RecordingWriter(directory) as writer:
-        for index, frame in enumerate(frames):  # filed in their order, whatever their stamps
+        for index, frame in enumerate(frames):  # recorded in their order, whatever their stamps
             writer.write(POSE_RAW, frame, frames[0].stamp_ns + index)
 
 
