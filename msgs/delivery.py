@@ -101,7 +101,7 @@ WRAP = 2**32
 
 
 @dataclass(eq=False)
-class _Place:
+class _Progress:
     """Progress of a subscriber.
 
     Attributes:
@@ -133,18 +133,18 @@ class Deliveries:
         self.sequence = Counter(sequence)
         """sequence number of the next message, by topic"""
         self._names = frozenset(names)
-        self._live: dict[Listener, _Place] = {}
-        self._last: dict[str, _Place] = {}  # by name, the most recent subscriber, connected or not
+        self._live: dict[Listener, _Progress] = {}
+        self._last: dict[str, _Progress] = {}  # by name, the most recent subscriber, connected or not
         self._kept: deque[tuple[str, int, bytes]] = deque()
 
     def sent(self, topic: str, frame: bytes) -> None:
         """Record that the next message of a topic was sent as ``frame``."""
-        for place in self._live.values():
-            if not place.silent_s(self.sequence):
-                place.sign_s = time.monotonic()
-        if any(topic in place.following for place in self._last.values()):
+        for progress in self._live.values():
+            if not progress.silent_s(self.sequence):
+                progress.sign_s = time.monotonic()
+        if any(topic in progress.following for progress in self._last.values()):
             self._kept.append((topic, self.sequence[topic], frame))
-            self._let_go()
+            self._drop_unneeded()
         self.sequence[topic] = (self.sequence[topic] + 1) % WRAP
 
     def join(self, listener: Listener) -> list[bytes]:
@@ -154,13 +154,13 @@ class Deliveries:
         before = self._last.get(listener.name)  # a successor recognises what it need not receive again
         inherited = before.following if before else {}
         following = {topic: inherited.get(topic, self.sequence[topic]) for topic in listener.reliable}
-        self._live[listener] = self._last[listener.name] = place = _Place(
+        self._live[listener] = self._last[listener.name] = progress = _Progress(
             following, min(max(listener.context, 0), MAX_CONTEXT), time.monotonic()
         )
         return [
             frame
             for topic, sequence, frame in self._kept
-            if topic in following and _ahead(sequence + place.context, following[topic])
+            if topic in following and _ahead(sequence + progress.context, following[topic])
         ]
 
     def leave(self, listener: Listener) -> None:
@@ -170,8 +170,8 @@ class Deliveries:
             return
         last = self._last[listener.name]
         if last is gone:
-            same = (place for other, place in self._live.items() if other.name == listener.name)
-            self._last[listener.name] = next((place for place in same if not self._is_deaf(place)), gone)
+            same = (progress for other, progress in self._live.items() if other.name == listener.name)
+            self._last[listener.name] = next((progress for progress in same if not self._is_deaf(progress)), gone)
         elif self._is_deaf(last):
             self._last[listener.name] = gone
 
@@ -182,50 +182,52 @@ class Deliveries:
 
     def take(self, taken: Taken) -> None:
         """Record an acknowledgement. Impossible ones are ignored."""
-        for listener, place in self._live.items():
-            if listener.instance == taken.instance and taken.topic in place.following:
-                place.sign_s = time.monotonic()
-                further = (taken.following - place.following[taken.topic]) % WRAP
+        for listener, progress in self._live.items():
+            if listener.instance == taken.instance and taken.topic in progress.following:
+                progress.sign_s = time.monotonic()
+                further = (taken.following - progress.following[taken.topic]) % WRAP
                 if further < WRAP // 2:  # after a publisher's restart it may be ahead of the resent messages
-                    further = min(further, self._behind(place, taken.topic))
-                    place.following[taken.topic] = (place.following[taken.topic] + further) % WRAP
-        self._let_go()
+                    further = min(further, self._behind(progress, taken.topic))
+                    progress.following[taken.topic] = (progress.following[taken.topic] + further) % WRAP
+        self._drop_unneeded()
 
     def waited_for(self, topic: str) -> frozenset[str]:
         """Names of the subscribers that must acknowledge messages before the topic's next message is sent."""
         return frozenset(
             listener.name
-            for listener, place in self._live.items()
-            if topic in place.following and not self._is_deaf(place) and self._behind(place, topic) >= WINDOW
+            for listener, progress in self._live.items()
+            if topic in progress.following and not self._is_deaf(progress) and self._behind(progress, topic) >= WINDOW
         )
 
     def silent(self, for_s: float) -> frozenset[str]:
         """Names of the connected subscribers that have had unread messages for longer than ``for_s``."""
         return frozenset(
-            listener.name for listener, place in self._live.items() if place.silent_s(self.sequence) > for_s
+            listener.name for listener, progress in self._live.items() if progress.silent_s(self.sequence) > for_s
         )
 
     def is_taken(self, topic: str, sequence: int) -> bool:
         """Whether all reliable subscribers of a topic have acknowledged a message."""
         return all(
-            topic not in place.following or self._is_deaf(place) or not _ahead(sequence, place.following[topic])
-            for place in (*self._last.values(), *self._live.values())
+            topic not in progress.following
+            or self._is_deaf(progress)
+            or not _ahead(sequence, progress.following[topic])
+            for progress in (*self._last.values(), *self._live.values())
         )
 
-    def _is_deaf(self, place: _Place) -> bool:
-        return place in self._live.values() and place.silent_s(self.sequence) > DEAF_S
+    def _is_deaf(self, progress: _Progress) -> bool:
+        return progress in self._live.values() and progress.silent_s(self.sequence) > DEAF_S
 
-    def _behind(self, place: _Place, topic: str) -> int:
-        return (self.sequence[topic] - place.following[topic]) % WRAP
+    def _behind(self, progress: _Progress, topic: str) -> int:
+        return (self.sequence[topic] - progress.following[topic]) % WRAP
 
-    def _let_go(self) -> None:
+    def _drop_unneeded(self) -> None:
         """Drop messages that no subscriber can still request, and the oldest ones if a subscriber stays away."""
         while self._kept:
             topic, sequence, _ = self._kept[0]
             wanted = any(
-                topic in place.following and _ahead(sequence + place.context, place.following[topic])
-                for place in (*self._last.values(), *self._live.values())
-                if not self._is_deaf(place)
+                topic in progress.following and _ahead(sequence + progress.context, progress.following[topic])
+                for progress in (*self._last.values(), *self._live.values())
+                if not self._is_deaf(progress)
             )
             if wanted and (self.sequence[topic] - sequence) % WRAP <= WINDOW + MAX_CONTEXT:
                 return

@@ -34,7 +34,7 @@ class Answers:
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
         self._refused_before = 0
-        self._flagged_looks = 0
+        self._flagged_checks = 0
         self._forget()
 
     def asked(self, raw: PoseRaw) -> None:
@@ -60,8 +60,8 @@ class Answers:
                 )
             )
         nearly_all = self._out >= ENOUGH and self._flagged > MAX_SHARE * self._out
-        self._flagged_looks = self._flagged_looks + 1 if nearly_all else 0
-        if self._flagged_looks >= CHECKS:
+        self._flagged_checks = self._flagged_checks + 1 if nearly_all else 0
+        if self._flagged_checks >= CHECKS:
             found.append(
                 warning(
                     "nearly_all_flagged",

@@ -81,8 +81,8 @@ def compile_part() -> None:
     """Entry point of a compiling process: does one of the two parts, and writes each finished loop's name to a pipe."""
     part, pipe = sys.argv[1:]
     gc.set_threshold(_GARBAGE)
-    with open(int(pipe), "w", encoding="utf-8", buffering=1) as said:
-        loop_cache.watchers.append(lambda name: print(name, file=said))
+    with open(int(pipe), "w", encoding="utf-8", buffering=1) as names:
+        loop_cache.watchers.append(lambda name: print(name, file=names))
         {"beginning": compile_from_the_beginning, "end": compile_from_the_end}[part]()
 
 
@@ -124,7 +124,7 @@ def _locked(file: TextIO, within_s: float) -> bool:
 
 
 def _compile(folder: Path, say: Callable[[str], None]) -> None:
-    started = said = time.monotonic()
+    started = reported = time.monotonic()
     say("compiling the loops for this processor, once; this takes about half a minute on two cores")
     ready: set[str] = set()
     reading, writing = os.pipe()
@@ -145,8 +145,8 @@ def _compile(folder: Path, say: Callable[[str], None]) -> None:
             with open(reading, encoding="utf-8") as names:
                 for name in names:
                     ready.add(name.strip())
-                    if time.monotonic() - said >= SAY_S:
-                        said = time.monotonic()
+                    if time.monotonic() - reported >= SAY_S:
+                        reported = time.monotonic()
                         say(f"compiling {len(ready)} of {loop_cache.LOOPS}, once")
             statuses = [process.wait() for process in processes]
         finally:

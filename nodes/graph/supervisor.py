@@ -160,8 +160,8 @@ class Child:
 def _environment(run: str) -> dict[str, str]:
     """The environment of a node: this process's, without the variables that systemd addresses to the supervisor."""
     kept = own_environment()
-    for said in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
-        kept.pop(said, None)
+    for variable in ("NOTIFY_SOCKET", "WATCHDOG_USEC"):
+        kept.pop(variable, None)
     return kept | {SUPERVISOR: str(os.getpid()), RUN: run}
 
 

@@ -37,7 +37,7 @@ class TrajectoryNode(Node):
         super().__init__(launch, clock)
         one_thread()
         self._pipeline = make_trajectory(launch.table("trajectory"))
-        self._of_clients: dict[str, TrajectoryPipeline] = {}
+        self._client_pipelines: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
 
@@ -54,14 +54,14 @@ class TrajectoryNode(Node):
         clients = len(self.launch.server.clients)
         if not clients:
             return self._pipeline
-        pipeline = self._of_clients.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
-        self._of_clients[source] = pipeline
-        if len(self._of_clients) > clients:  # a client reconnected under another name
-            del self._of_clients[next(iter(self._of_clients))]
+        pipeline = self._client_pipelines.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
+        self._client_pipelines[source] = pipeline
+        if len(self._client_pipelines) > clients:  # a client reconnected under another name
+            del self._client_pipelines[next(iter(self._client_pipelines))]
         return pipeline
 
     def status(self) -> dict[str, str]:
-        counters = sum((p.counters for p in self._of_clients.values()), self._pipeline.counters)
+        counters = sum((p.counters for p in self._client_pipelines.values()), self._pipeline.counters)
         return {"bodies": str(self._bodies), "delay_frames": str(self._delay_frames)} | {
             f"refused.{cause}": str(n) for cause, n in counters.items()
         }

@@ -74,7 +74,7 @@ class Filter:
         prior = given["prior"]
         self._prior, self._trajectory = make_prior(prior), make_trajectory(given["trajectory"])
         one_thread()
-        load_loops(PriorSettings.from_dict(prior))  # now, and not when the first frame comes
+        load_loops(PriorSettings.from_dict(prior))  # now, so that the first frame does not wait for it
         self._diagnosis = Diagnosis(PriorSettings.from_dict(prior))
         self._next_look = CHECKED
         self._last: PoseRaw | None = None
@@ -132,7 +132,7 @@ class Filter:
         self._last = raw
         poses = self._poses(self._prior.process(raw))
         if self._diagnosis.frames == self._next_look:
-            self._next_look *= 2  # a look takes as long as several frames: seldom, once there was nothing to say
+            self._next_look *= 2  # a check takes as long as several frames, so checks become rarer
             warn(self._diagnosis.look())
         return poses
 
@@ -175,7 +175,7 @@ class Filter:
         positions = as_array("joints", joints)
         wanted = (len(layout.joints), 3)
         several = positions.ndim == 3
-        if positions.size == 0 and positions.ndim in (1, 3):  # nobody; [] does not say of which form somebody would be
+        if positions.size == 0 and positions.ndim in (1, 3):  # nobody; [] does not show whether B is an axis
             return [], several or self._several
         if positions.dtype.kind not in "fiu" or positions.shape[-2:] != wanted or positions.ndim not in (2, 3):
             hint = axes_hint((1, *positions.shape[-2:]), self._skeleton) if positions.ndim > 1 else ""
@@ -217,7 +217,7 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
 
 
 def _arrays(clean: PoseClean, world: Mapping[int, WorldBody], *, several: bool) -> dict[str, NDArray[Any]]:
-    """As those of `NpzCollector`, of one moment."""
+    """The arrays of `NpzCollector` for a single frame."""
     bodies = clean.bodies if several else clean.bodies[:1]
     rows = [_row(body, world.get(body.id)) for body in bodies]
     common: dict[str, NDArray[Any]] = {"stamp_ns": np.array(clean.stamp_ns), "joint_names": _NAMES}

@@ -1,5 +1,5 @@
-"""What `steadypose.Filter` and `steadypose.clean` give: arrays by name, and joints by theirs; and data to try them on,
-the streams of the project's own simulator.
+"""`Poses`, the result of `steadypose.Filter` and `steadypose.clean`, with joints accessible by name; and `sample` data
+from steadypose's simulator.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def _installed(name: str) -> Any:
     """Import an optional library, which no extra installs.
 
     Raises:
-        ModuleNotFoundError: it is not installed; says what to type.
+        ModuleNotFoundError: it is not installed. The text has the command to install it.
     """
     try:
         return importlib.import_module(name)
@@ -249,7 +249,7 @@ class Sample:
     """A recording of a simulated depth camera, with hidden joints, jumps and noise.
 
     Attributes:
-        positions: (T, 22, 3) metres, world, z up; NaN where a joint was not seen. With several bodies, (T, B, 22, 3).
+        positions: (T, 22, 3) metres, world, z up; NaN where unobserved. With several bodies, (T, B, 22, 3).
         stamp_ns: (T,) times of capture in nanoseconds.
         truth: ground truth without noise or gaps, in the shape of ``positions``, interpolated at these stamps.
     """

@@ -277,12 +277,12 @@ def draw_path(ax: Axes, history: History, body: int) -> None:
     ax.set_title("from above, m", loc="left", fontsize=10, weight="bold")
     topic = next(t for t in (POSE_WORLD, POSE_CLEAN, POSE_RAW, POSE_TRUTH) if t in history.tracks)
     for person in history.tracks.get(POSE_TRUTH, {}).values():
-        _, way = with_gaps(person.time, person.positions[:, 0, :2])
-        ax.plot(*way.T, color=TRUTH_COLOUR, linewidth=3, alpha=0.35)
+        _, trail = with_gaps(person.time, person.positions[:, 0, :2])
+        ax.plot(*trail.T, color=TRUTH_COLOUR, linewidth=3, alpha=0.35)
     for other, track in history.tracks[topic].items():
         pelvis = track.positions[:, 0, :2]
-        _, way = with_gaps(track.time, pelvis)
-        ax.plot(*way.T, color=WORLD_COLOUR if other == body else RAW_COLOUR, linewidth=1.5)
+        _, trail = with_gaps(track.time, pelvis)
+        ax.plot(*trail.T, color=WORLD_COLOUR if other == body else RAW_COLOUR, linewidth=1.5)
         seen = np.flatnonzero(np.isfinite(pelvis[:, 0]))
         if len(seen):
             ax.annotate(f"{other}", tuple(pelvis[seen[0]]), fontsize=8, textcoords="offset points", xytext=(4, 4))

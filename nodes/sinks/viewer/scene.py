@@ -206,7 +206,9 @@ class PoseView:
                 continue
             path = _entity("world", message.source, body)
             self._body(path, positions, body.state, body.sigma)
-            self._log(f"{path}/path", rr.LineStrips3D([self._way(path, message, body)], colors=PATH_RGB, radii=0.01))
+            self._log(
+                f"{path}/path", rr.LineStrips3D([self._floor_path(path, message, body)], colors=PATH_RGB, radii=0.01)
+            )
             touching = body.contacts > CONTACT_PROBABILITY
             self._log(
                 f"{path}/contacts",
@@ -252,13 +254,13 @@ class PoseView:
         colours = colours[drawable] if isinstance(colours, np.ndarray) else colours
         self._log(path, rr.LineStrips3D(ends[drawable], colors=colours, radii=radius))
 
-    def _way(self, path: str, message: PoseWorld, body: WorldBody) -> NDArray[np.float64]:
+    def _floor_path(self, path: str, message: PoseWorld, body: WorldBody) -> NDArray[np.float64]:
         """(N, 3) path of the body over the floor in the last seconds, metres."""
-        way = self._paths.setdefault(path, deque())
-        way.append((message.stamp_ns, np.array([*body.root_position[:2], 0.005])))
-        while message.stamp_ns - way[0][0] > PATH_SECONDS * 1e9 or way[0][0] > message.stamp_ns:
-            way.popleft()
-        return np.stack([point for _, point in way])
+        trail = self._paths.setdefault(path, deque())
+        trail.append((message.stamp_ns, np.array([*body.root_position[:2], 0.005])))
+        while message.stamp_ns - trail[0][0] > PATH_SECONDS * 1e9 or trail[0][0] > message.stamp_ns:
+            trail.popleft()
+        return np.stack([point for _, point in trail])
 
     def _clear_absent(self, key: str, drawn: set[str]) -> None:
         import rerun as rr

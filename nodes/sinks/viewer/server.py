@@ -42,7 +42,7 @@ class Drawings:
     def __init__(self) -> None:
         self._first: list[bytes] = []
         self._later: deque[bytes] = deque()
-        self._let_go = 0
+        self._dropped = 0
         self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -57,7 +57,7 @@ class Drawings:
                 self._bytes += len(piece)
             while self._bytes > MOST_BYTES:
                 self._bytes -= len(self._later.popleft())
-                self._let_go += 1
+                self._dropped += 1
             self._changed.notify_all()
 
     def follow(self) -> Iterator[bytes]:
@@ -67,9 +67,9 @@ class Drawings:
             with self._changed:
                 first, later = self._first[at:], []
                 if not first:
-                    start = max(at - FIRST - self._let_go, 0)
+                    start = max(at - FIRST - self._dropped, 0)
                     later = [self._later[index] for index in range(start, len(self._later))]
-                    at = FIRST + self._let_go + len(self._later) if later else at
+                    at = FIRST + self._dropped + len(self._later) if later else at
                 at += len(first)
                 if not first and not later:
                     self._changed.wait(WAIT_S)
