@@ -1,1 +1,1 @@
-"""Benchmarks: protocols, baselines, and the last results: ``python -m steadypose.benchmarks.NAME --help``."""
+"""Benchmarks: studies, baselines and the latest results. Run ``steadypose evaluate STUDY``."""

@@ -1,7 +1,6 @@
-"""Corruption of true joints for the protocols: noise and hidden joints. Every function takes and gives (T, C, J, 3)
-metres.
+"""Corrupts true joints for the studies: noise and hidden joints. Functions take and return (T, C, J, 3) metres.
 
-A hidden joint is NaN. The functions draw from the generator that they are given and change nothing in place.
+Hidden joints are NaN. The functions draw from the generator that you pass and change nothing in place.
 """
 
 from __future__ import annotations
@@ -23,30 +22,32 @@ LIMBS: tuple[NDArray[np.intp], ...] = tuple(
     for joints in (("elbow", "wrist"), ("knee", "ankle", "foot"))
     for side in ("left", "right")
 )
-"""What a detector loses, or takes for the other side's: lower arms and legs."""
+"""Limbs that a detector loses or swaps: lower arms and legs."""
 
 
 def gaussian(truth: Floats, sigma: float, rng: np.random.Generator) -> Floats:
-    """Independent noise, ``sigma`` metres along each axis (HuMoR's protocol has 0.04)."""
+    """Add independent noise of ``sigma`` metres along each axis (0.04 in HuMoR's protocol)."""
     return truth + rng.normal(0.0, sigma, truth.shape)
 
 
 def along_sight(truth: Floats, sigma: float, rng: np.random.Generator, ratio: float = 3.0) -> Floats:
-    """Independent noise of ``sigma`` metres across the line of sight of a camera at the origin, and ``ratio`` times as
-    much along it: what depth is like."""
+    """Add independent noise like depth errors: ``sigma`` metres across the line of sight of a camera at the origin, and
+    ``ratio`` times as much along it."""
     noise = rng.normal(0.0, sigma, truth.shape)
     sight = truth / np.linalg.norm(truth, axis=-1, keepdims=True)
     return truth + noise + (ratio - 1) * (noise * sight).sum(axis=-1, keepdims=True) * sight
 
 
 def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:
-    """Stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` from a frame to the next: like a depth
-    camera's errors, which no low-pass filter separates from motion."""
+    """Add stationary AR(1) noise of ``sigma`` metres, with correlation ``memory`` between frames.
+
+    It resembles a depth camera's errors, which no low-pass filter separates from motion.
+    """
     return truth + time_correlated(rng.normal(0.0, sigma, truth.shape), memory)
 
 
 def spiked(seen: Floats, rng: np.random.Generator, share: float = 0.01, size: float = 0.30) -> Floats:
-    """One observation in a hundred lies 30 cm off, in any direction."""
+    """Displace one observation in a hundred by 30 cm, in a random direction."""
     direction = rng.normal(size=seen.shape)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     hit = rng.random(seen.shape[:-1]) < share
@@ -54,7 +55,8 @@ def spiked(seen: Floats, rng: np.random.Generator, share: float = 0.01, size: fl
 
 
 def swapped(seen: Floats, rng: np.random.Generator, rate: float = 0.02, mean_frames: float = 3.0) -> Floats:
-    """Left and right lower arms, or legs, are exchanged for a few frames; ``rate``: swaps that begin, a frame."""
+    """Swap left and right lower arms, or legs, for a few frames; ``rate`` is the number of swaps that begin per
+    frame."""
     frames, clips = seen.shape[:2]
     out = seen.copy()
     for left, right in zip(LIMBS[::2], LIMBS[1::2], strict=True):
@@ -69,15 +71,15 @@ def swapped(seen: Floats, rng: np.random.Generator, rate: float = 0.02, mean_fra
 
 
 def below(truth: Floats, height: float = 0.9) -> Mask:
-    """(T, C, J) the joints lower than ``height`` metres (HuMoR's occlusion)."""
+    """Return the joints (T, C, J) lower than ``height`` metres (HuMoR's occlusion)."""
     return truth[..., 2] < height
 
 
 def arm_behind(truth: Floats, radius: float = 0.16) -> Mask:
-    """(T, C, J) elbows and wrists that the trunk hides from a camera 3 m to the body's left, 1.2 m up.
+    """Return the elbows and wrists (T, C, J) that the trunk hides from a camera 3 m to the body's left, 1.2 m up.
 
-    The trunk is a capsule of ``radius`` metres from pelvis to neck. The camera stands where the middle of the clip
-    puts it.
+    The trunk is a capsule of ``radius`` metres from pelvis to neck. The camera is placed relative to the body in the
+    middle of the clip.
     """
     middle = truth[len(truth) // 2]
     left = middle[:, J["left_hip"]] - middle[:, J["right_hip"]]
@@ -94,8 +96,8 @@ def arm_behind(truth: Floats, radius: float = 0.16) -> Mask:
 
 
 def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.Generator) -> Mask:
-    """(T, C, J) one limb of every clip hidden for ``frames`` frames, at a random time from frame ``first`` on, at least
-    a third of a second before the end."""
+    """Hide one limb of every clip for ``frames`` frames, (T, C, J). It starts at a random time from frame ``first`` on
+    and ends at least a third of a second before the clip does."""
     hidden = np.zeros(shape, dtype=bool)
     starts = rng.integers(first, shape[0] - frames - 10, endpoint=True, size=shape[1])
     limbs = rng.integers(len(LIMBS), size=shape[1])
@@ -105,5 +107,5 @@ def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.
 
 
 def hide(seen: Floats, hidden: Mask) -> Floats:
-    """NaN where hidden."""
+    """Set hidden joints to NaN."""
     return np.where(hidden[..., None], np.nan, seen)

@@ -1,4 +1,4 @@
-"""``steadypose evaluate``: runs studies, each with its baselines, and files what they find."""
+"""``steadypose evaluate``: runs studies with their baselines and writes their results."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def evaluate(
     """
     if (needed := _missing(study, mocap, data)) is not None:
         raise FileNotFoundError(f"{study}: expected {needed}")
-    # torch, after the arguments are known to be right
+    # torch is imported after the arguments are checked
     from rich.console import Console
     from rich.progress import Progress
 
@@ -91,7 +91,7 @@ def evaluate(
 
 
 def _missing(study: str, mocap: Path | None, data: Path) -> str | None:
-    """What this study needs and is not there."""
+    """Return what this study needs and is missing."""
     if study in PREPARED and not data.is_file():
         return "--data FILE, prepared motion"
     file = SENSORS.get(study)

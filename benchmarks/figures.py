@@ -1,4 +1,4 @@
-"""Pictures of results: curves of error against delay, noise or gap, and reliability plots."""
+"""Plots of results: curves over delay, noise or gap, and reliability plots."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ COLOURS = {
     "steadypose": "#e45756",
     "steadypose, sensor known": "#5b2a86",
 }
-"""One colour a method in every picture; one not named here takes matplotlib's next."""
+"""Colour of each method in every plot; other methods take matplotlib's next."""
 
 
 def curves(
     records: Sequence[Mapping[str, Any]], x: str, panels: Mapping[str, str], label: str, title: str, log: bool = False
 ) -> Figure:
-    """A panel for each figure, a line for each method.
+    """Plot a panel for each figure, with a line for each method.
 
     Args:
-        records: with ``method``, ``x`` and the panels' keys.
-        x: the key across.
-        panels: keys upwards, with the text of their axis.
-        label: text of the axis across.
-        title: above.
+        records: records with ``method``, ``x`` and the panels' keys.
+        x: key of the horizontal axis.
+        panels: keys of the vertical axes, with their labels.
+        label: label of the horizontal axis.
+        title: title of the plot.
         log: whether both axes are logarithmic.
     """
     figure = Figure(figsize=(4.6 * len(panels) + 1.8, 3.9), layout="constrained")
@@ -69,11 +69,12 @@ def curves(
 
 
 def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: str) -> Figure:
-    """Error found against standard deviation stated, both root mean squares along an axis; the diagonal is honest.
+    """Plot the error over the predicted standard deviation, both root mean squares along an axis. The diagonal is
+    calibrated.
 
     Args:
-        bins: by group, (stated, found, count) in metres.
-        title: above.
+        bins: (predicted, observed, count) by group, metres.
+        title: title of the plot.
     """
     figure = Figure(figsize=(4.8, 4.4), layout="constrained")
     axis = figure.subplots()

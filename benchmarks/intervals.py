@@ -1,8 +1,8 @@
-"""Means over people, with the interval that so few people leave.
+"""Means over people, with confidence intervals.
 
-Clips of one person are alike: an interval over clips says how well these people are known, not people. So the mean is
-that of the people's own means, and its interval is found by drawing people, with all their clips, with replacement
-(cluster bootstrap: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 3.8).
+Clips of one person are alike. An interval over clips would say how well these people are known, not people in general.
+So the mean is that of the people's own means. Its interval comes from drawing people, with all their clips, with
+replacement (cluster bootstrap: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 3.8).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class Interval(NamedTuple):
     """A mean over people.
 
     Attributes:
-        mean: of the people's own means; NaN of nobody.
-        low, high: the 95 % interval; NaN of a single person, about whom it says nothing.
-        people: how many.
+        mean: mean of the people's own means; NaN without people.
+        low, high: 95 % interval; NaN for a single person.
+        people: number of people.
     """
 
     mean: float
@@ -33,7 +33,7 @@ class Interval(NamedTuple):
     people: int
 
     def text(self, digits: int, scale: float = 1.0) -> str:
-        """For a table: the mean, and in brackets the interval where there is one; a dash where there is no mean."""
+        """Format for a table: the mean, with the interval in brackets if there is one; a dash if there is no mean."""
         if np.isnan(self.mean):
             return NONE
         mean, low, high = (f"{scale * value:.{digits}f}" for value in self[:3])
@@ -41,11 +41,11 @@ class Interval(NamedTuple):
 
 
 def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> NDArray[np.float64]:
-    """(P,) the mean of each person's clips, people in alphabetical order; those of whom nothing is known are left out.
+    """Return the mean of each person's clips (P,), in alphabetical order. People without values are left out.
 
     Args:
-        values: (N,) one a clip; NaN where a clip has none.
-        people: (N,) whose clip it is.
+        values: (N,) one per clip; NaN where a clip has none.
+        people: (N,) person of each clip.
     """
     values, people = np.asarray(values, dtype=np.float64), np.asarray(people)
     known = np.isfinite(values)
@@ -54,24 +54,25 @@ def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) ->
 
 
 def interval(values: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
-    """The mean over people and its 95 % interval.
+    """Return the mean over people and its 95 % interval.
 
     Args:
-        values: (N,) one a clip; NaN where a clip has none.
-        people: (N,) whose clip it is.
-        seed: of the draws.
+        values: (N,) one per clip; NaN where a clip has none.
+        people: (N,) person of each clip.
+        seed: seed of the draws.
     """
     return _interval(people_means(values, people), seed)
 
 
 def ratio(values: ArrayLike, baseline: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
-    """The same of the ratio of two methods on the same clips: the geometric mean of the people's own ratios.
+    """Return the ratio of two methods on the same clips, with its interval: the geometric mean of the people's own
+    ratios.
 
     Args:
-        values: (N,) one a clip, above zero.
-        baseline: (N,) the same of the other; a clip counts where both have a value.
-        people: (N,) whose clip it is.
-        seed: of the draws.
+        values: (N,) one per clip, above zero.
+        baseline: (N,) values of the other method; a clip counts if both have a value.
+        people: (N,) person of each clip.
+        seed: seed of the draws.
     """
     values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     both = np.isfinite(values) & np.isfinite(baseline)

@@ -1,4 +1,5 @@
-"""Metrics, as the papers define them: arrays in, arrays out, SI units, NaN where there is nothing to compare."""
+"""Metrics as defined by the papers. Functions take and return arrays in SI units, NaN where there is nothing to
+compare."""
 
 from __future__ import annotations
 
@@ -11,20 +12,20 @@ from steadypose.prior.arrays import Floats
 
 
 def position_error(estimate: Floats, truth: Floats) -> Floats:
-    """Distance between (T, J, 3) and (T, J, 3), metres: (T, J). Its mean is the MPJPE."""
+    """Return the distance between (T, J, 3) and (T, J, 3), metres: (T, J). Its mean is the MPJPE."""
     return np.linalg.norm(estimate - truth, axis=-1)
 
 
 def acceleration_error(estimate: Floats, truth: Floats) -> Floats:
-    """Norm of the difference of the second differences, (T-2, J) metres/frame² (Kanazawa et al. 2019).
+    """Return the norm of the difference of the second differences, (T-2, J) metres/frame² (Kanazawa et al. 2019).
 
-    Times fps² it is in m/s²: at 30 Hz, 1 mm/frame² is 0.9 m/s².
+    Multiply by fps² for m/s²: at 30 Hz, 1 mm/frame² is 0.9 m/s².
     """
     return np.linalg.norm(np.diff(estimate - truth, n=2, axis=0), axis=-1)
 
 
 def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> float:
-    """How far bones are from constant: standard deviation over time by mean length, the mean over bones.
+    """Return the variation of bone lengths: standard deviation over time by mean length, averaged over bones.
 
     Args:
         positions: (T, J, 3) metres.
@@ -36,9 +37,9 @@ def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> flo
 
 
 def contact_speed(positions: Floats, contact: NDArray[np.bool_], stamps_s: Floats) -> Floats:
-    """Horizontal speed of joints from one frame to the next where both are in contact, m/s: (T-1, J), else NaN.
+    """Return the horizontal speed of joints in contact in both frames, m/s: (T-1, J), else NaN.
 
-    Each foot counts for itself: its mean is the foot skate.
+    Each foot counts separately. The mean is the foot skate.
 
     Args:
         positions: (T, J, 3) metres, z up.
@@ -50,9 +51,9 @@ def contact_speed(positions: Floats, contact: NDArray[np.bool_], stamps_s: Float
 
 
 def procrustes(source: Floats, target: Floats) -> Floats:
-    """``source`` (..., J, 3), every frame turned, moved and scaled to lie nearest to ``target``: for PA-MPJPE.
+    """Align ``source`` (..., J, 3) with ``target`` in each frame by rotation, translation and scale, for PA-MPJPE.
 
-    A joint that is not finite in either takes no part in the fit. (Umeyama 1991.)
+    Joints that are not finite in either are left out of the fit (Umeyama 1991).
     """
     both = (np.isfinite(source) & np.isfinite(target)).all(axis=-1, keepdims=True)
     count = np.maximum(both.sum(axis=-2, keepdims=True), 1)
@@ -68,12 +69,12 @@ def procrustes(source: Floats, target: Floats) -> Floats:
 
 
 def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
-    """Frames by which ``estimate`` (T, ..., 3) lags behind ``truth``: where their velocities correlate best.
+    """Return the lag of ``estimate`` (T, ..., 3) behind ``truth``, frames: where their velocities correlate best.
 
-    Correlated are all coordinates together; between frames, a parabola through the best three.
+    All coordinates are correlated together. A parabola through the best three lags gives fractions of a frame.
 
     Args:
-        most: frames, the largest lag, and lead, that is considered.
+        most: largest lag and lead considered, frames.
     """
     a, b = (np.diff(x.reshape(len(x), -1), axis=0) for x in (estimate, truth))
     whole = np.isfinite(a).all(axis=0)
@@ -91,11 +92,12 @@ def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
 
 
 def sigma_ratio(error: Floats, sigma: Floats) -> float:
-    """Error found by standard deviation stated, root mean squares of the ratio along an axis; 1 is honest.
+    """Return the error-to-sigma ratio: the root mean square of error over sigma, along an axis. It is 1 when
+    calibrated.
 
     Args:
         error: (...) metres, distances in space.
-        sigma: (...) metres, along an axis; where it is infinite or the error NaN, nothing was stated.
+        sigma: (...) metres, along an axis. Entries with infinite sigma or NaN error are left out.
     """
     ratio = error / sigma / np.sqrt(3)
     known = np.isfinite(ratio) & np.isfinite(sigma)
@@ -103,8 +105,10 @@ def sigma_ratio(error: Floats, sigma: Floats) -> float:
 
 
 def reliability(error: Floats, sigma: Floats, bins: int = 10) -> list[tuple[float, float, int]]:
-    """(stated, found, count) of ``bins`` equal parts of the joints by their stated standard deviation, metres, along
-    an axis, root mean squares. Arguments as for `sigma_ratio`."""
+    """Return (predicted, observed, count) for ``bins`` equal parts of the joints, sorted by their predicted deviation.
+
+    Both are root mean squares along an axis, metres. For the arguments see `sigma_ratio`.
+    """
     known = np.isfinite(error) & np.isfinite(sigma)
     order = np.argsort(sigma[known], kind="stable")
     return [
@@ -117,19 +121,20 @@ def reliability(error: Floats, sigma: Floats, bins: int = 10) -> list[tuple[floa
 
 
 def quaternion_distance(estimate: Floats, truth: Floats) -> Floats:
-    """L2Q of LAFAN1 (Harvey et al. 2020): of global rotations (T, J, 4), the norm of all components' difference, (T,).
+    """Return LAFAN1's L2Q (Harvey et al. 2020): the norm of the difference of global rotations (T, J, 4), (T,).
 
-    A quaternion and its opposite are the same rotation: each is compared by the nearer of the two.
+    A quaternion and its opposite are the same rotation; the nearer one is compared.
     """
     sign = np.where((estimate * truth).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
     return np.sqrt(((sign * estimate - truth) ** 2).sum(axis=(-1, -2)))
 
 
 def npss(estimate: Floats, truth: Floats) -> float:
-    """Normalised power spectrum similarity of motions (N, T, D): 0 is the same (Gopalakrishnan et al. 2019).
+    """Return the normalised power spectrum similarity of motions (N, T, D); 0 is identical (Gopalakrishnan et al.
+    2019).
 
-    The power spectra over time, made to sum to 1, are compared by how much has to be moved from frequency to frequency;
-    tracks count by the power that they have in truth.
+    Power spectra over time are normalised to sum 1 and compared by the earth mover's distance over frequencies. Tracks
+    are weighted by their true power.
     """
     power = [np.abs(np.fft.fft(x, axis=1)) ** 2 for x in (truth, estimate)]
     total = power[0].sum(axis=1)
@@ -138,7 +143,7 @@ def npss(estimate: Floats, truth: Floats) -> float:
 
 
 def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
-    """Axes forward, left, up of the trunk as columns: (..., 3, 3). Up runs from the hips to the shoulders.
+    """Return the trunk's axes forward, left and up as columns: (..., 3, 3). Up runs from the hips to the shoulders.
 
     Args:
         left_hip, right_hip, left_shoulder, right_shoulder: (..., 3) metres.
@@ -152,7 +157,7 @@ def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right
 
 
 def bootstrap(values: ArrayLike, draws: int = 2000, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of the mean of (N,) values, one a clip, by drawing clips with replacement."""
+    """Return the 95 % interval of the mean of (N,) values, one per clip, by drawing clips with replacement."""
     values = np.asarray(values, dtype=np.float64)
     picks = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
     low, high = np.quantile(values[picks].mean(axis=1), (0.025, 0.975))
@@ -162,7 +167,8 @@ def bootstrap(values: ArrayLike, draws: int = 2000, seed: int = 0) -> tuple[floa
 def bootstrap_ratio(
     values: ArrayLike, baseline: ArrayLike, draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Ratio of two means over the same (N,) clips, and its 95 % interval by drawing clips with replacement."""
+    """Return the ratio of two means over the same (N,) clips, and its 95 % interval by drawing clips with
+    replacement."""
     values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     picks = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
     low, high = np.quantile(values[picks].mean(axis=1) / baseline[picks].mean(axis=1), (0.025, 0.975))

@@ -1,4 +1,4 @@
-"""Ground-truth motion of the protocols: validation clips of prepared motion, or simulated people."""
+"""True motion for the studies: clips of prepared motion, or simulated people."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class MotionClips:
         positions: (T, C, 22, 3) metres, world, z up, floor at 0.
         rotations: (T, C, 22, 3, 3) local.
         offsets: (C, 22, 3) metres, each person's bones.
-        contacts: (T, C, 8) of `CONTACT_JOINTS`.
-        source: what these are, for the results file.
-        person: (C,) who moves (`benchmarks.intervals` makes means over people).
-        data_set: (C,) where each is from: tables have a column for each, before their mean.
+        contacts: (T, C, 8) labels of `CONTACT_JOINTS`.
+        source: description for the results file.
+        person: (C,) who moves (`benchmarks.intervals` averages over people).
+        data_set: (C,) data set of each; tables have a column for each, before their mean.
     """
 
     positions: Floats
@@ -44,15 +44,16 @@ class MotionClips:
 
     @property
     def stamps_s(self) -> Floats:
-        """(T,) seconds."""
+        """Stamps (T,), seconds."""
         return np.arange(len(self.positions)) / FPS
 
     def every(self, step: int) -> MotionClips:
-        """Every n-th clip."""
+        """Return every n-th clip."""
         return self._take(np.arange(0, len(self.offsets), step))
 
     def farthest(self, count: int) -> MotionClips:
-        """So many clips in which the pelvis travels the longest paths over the floor, as many of each person."""
+        """Return the ``count`` clips with the longest paths of the pelvis over the floor, equally many of each
+        person."""
         paths = np.linalg.norm(np.diff(self.positions[:, :, 0, :2], axis=0), axis=-1).sum(axis=0)
         order = np.argsort(-paths, kind="stable")
         taken = [order[self.person[order] == who][:share] for who, share in even_shares(self.person, count).items()]
@@ -71,8 +72,10 @@ class MotionClips:
 
 
 def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:
-    """Clips that do not overlap, at most ``most`` of them, from ``prepared.npz``: as many of each person, where there
-    are as many, spread evenly over what there is of them."""
+    """Return at most ``most`` clips from ``prepared.npz``, without overlap.
+
+    Each person has an equal share where they have as many, spread evenly over their clips.
+    """
     motion = prepared_set(path, split)
     rows = motion.all_windows(frames, frames)
     clip = np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1
@@ -94,8 +97,10 @@ def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClip
 
 
 def spread(people: NDArray[np.str_], most: int) -> NDArray[np.intp]:
-    """Which of (N,) to take, in order: at most so many, as many of each person as there are of an even share, evenly
-    over what there is of them."""
+    """Return the indices of at most ``most`` of (N,) clips, in order.
+
+    Each person has an equal share where they have as many, spread evenly over their clips.
+    """
     taken = []
     for person, share in even_shares(people, most).items():
         own = np.flatnonzero(people == person)
@@ -104,7 +109,8 @@ def spread(people: NDArray[np.str_], most: int) -> NDArray[np.intp]:
 
 
 def even_shares(people: NDArray[np.str_], most: int) -> dict[str, int]:
-    """How many of each person to take of ``most``: where one has fewer than an even share, the others get the rest."""
+    """Return each person's share of ``most``. If a person has fewer clips than an even share, the others get the
+    rest."""
     names, counts = np.unique(people, return_counts=True)
     shares: dict[str, int] = {}
     for place in np.argsort(counts, kind="stable"):
@@ -115,12 +121,12 @@ def even_shares(people: NDArray[np.str_], most: int) -> dict[str, int]:
 
 @lru_cache(maxsize=3)
 def prepared_set(path: Path, split: str) -> MotionSet:
-    """All clips of ``prepared.npz`` that are free for products."""
+    """Return all clips of ``prepared.npz`` that may be used in products."""
     return MotionSet.load(path, "default", split)
 
 
 def as_set(clips: MotionClips) -> MotionSet:
-    """Clips as training reads them, one after the other."""
+    """Return the clips in the form of training data, one after the other."""
     frames, count = clips.positions.shape[:2]
 
     def in_a_row(values: NDArray[Any]) -> torch.Tensor:
@@ -137,13 +143,13 @@ def as_set(clips: MotionClips) -> MotionSet:
 
 @lru_cache(maxsize=2)
 def digest(path: Path) -> str:
-    """The first 16 hexadecimal digits of a file's SHA-256."""
+    """Return the first 16 hexadecimal digits of a file's SHA-256."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def simulated_clips(frames: int, most: int, seed: int) -> MotionClips:
-    """The same of people of the project's own generator, for machines without prepared motion."""
+    """Return simulated clips by the project's own generator, for machines without prepared motion."""
     parts = []
     for number, motion in enumerate(_people(seed)):
         step = round(1 / (motion.times[1] - motion.times[0]) / FPS)
@@ -168,7 +174,7 @@ def simulated_clips(frames: int, most: int, seed: int) -> MotionClips:
 
 
 def _people(seed: int) -> Iterator[Motion]:
-    """All people of all scenes, repeated with other bodies and paths."""
+    """Yield the people of all scenes, repeated with other bodies and trajectories."""
     rng = np.random.default_rng(seed)
     while True:
         for script in SCRIPTS.values():

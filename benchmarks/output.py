@@ -1,5 +1,4 @@
-"""What the pipeline and the completer make of the bundled streams, as a few numbers that tell whether they still make
-the same."""
+"""Outputs of the pipeline and of completion on the bundled streams, reduced to a few numbers that reveal a change."""
 
 from __future__ import annotations
 
@@ -24,17 +23,17 @@ from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
 FRAMES = 120
-"""Frames of each bundled stream that go in."""
+"""Number of frames of each bundled stream that are processed."""
 PROJECTIONS = 8
-"""Numbers that are kept of an output."""
+"""Number of projections kept of each output."""
 
 
 @cache
 def outputs() -> dict[str, list[float]]:
-    """By name, random projections of an output: with default settings, with HM-VAE's refinement, and of `complete`.
+    """Return random projections of outputs by name: with default settings, with HM-VAE's refinement, and of `complete`.
 
-    A projection on weights of 1 and -1, over the root of their number, changes by about the root mean square of the
-    change: eight numbers tell by how much 100,000 differ.
+    A projection has weights of 1 and -1, divided by the root of their number. It changes by about the root mean square
+    change of the output, so eight numbers measure how much 100,000 differ.
     """
     paths = sorted(path.parent for path in (PACKAGE / "sim_data").glob("*/metadata.yaml"))
     default = [part for path in paths for part in _answers(path, PriorSettings())]
@@ -48,7 +47,7 @@ def outputs() -> dict[str, list[float]]:
 
 
 def _completed(path: Path) -> np.ndarray:
-    """Every body of a stream of which a second is left out, completed."""
+    """Complete every body of a stream with a gap of one second."""
     raws = [message for _, message in islice(open_recording(path), FRAMES) if isinstance(message, PoseRaw)]
     del raws[40:70]
     completer = LiveCompleter.load("default")
@@ -65,14 +64,14 @@ def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.nda
 
 
 def _numbers(body: CleanBody | WorldBody) -> np.ndarray:
-    """Positions, rotations, deviations, and contacts or the anomaly, in a row."""
+    """Return positions, rotations, deviations, and contacts or the anomaly, in a row."""
     last = body.contacts if isinstance(body, WorldBody) else [body.anomaly]
     parts = body.positions, body.rotations, body.sigma, last
     return np.nan_to_num(np.concatenate([np.ravel(part) for part in parts]), posinf=1.0).astype(np.float64)
 
 
 def projections(parts: Iterable[np.ndarray]) -> list[float]:
-    """Of numbers that come in parts."""
+    """Project an output that is given in parts."""
     values = np.concatenate(list(parts))
     signs = np.random.default_rng(0).integers(0, 2, (PROJECTIONS, len(values)), dtype=np.int8) * 2.0 - 1.0
     return [round(float(p), 7) for p in signs @ values / np.sqrt(len(values))]

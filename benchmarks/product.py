@@ -1,4 +1,4 @@
-"""steadypose in the bench: its variants, and clips through them, side by side as bodies of one stream."""
+"""steadypose's variants in the benchmarks. Clips are processed side by side, as bodies of one stream."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ PRODUCT: Mapping[str, PriorSettings] = {
     ),
     "steadypose": PriorSettings(),
 }
-"""Every variant that each protocol runs; one line adds one. HM-VAE is the paper's refinement alone, unfused."""
+"""Variants that each study runs; add one in one line. HM-VAE is the paper's refinement alone, without fusion."""
 
 SIDE_BY_SIDE = 64
-"""Clips in one stream: bodies do not touch each other, and many together take a fraction of the time."""
+"""Number of clips in one stream. Bodies do not affect each other, and many together take a fraction of the time."""
 
 SLOTS_A_CLIP = 4
-"""So that each is treated as a person alone: where all slots are taken, people take turns to be imputed."""
+"""Number of slots per clip, so that each is treated as a person alone. If all slots are taken, people take turns to be
+imputed."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class Cleaned:
     """The content of ``pose/clean``.
 
     Attributes:
-        stamps_s: (T',) seconds, of the prior's own 30 Hz grid.
-        positions: (T', C, 22, 3) metres; NaN where there was no estimate.
-        sigma: (T', C, 22) metres, the standard deviation stated, along an axis.
-        anomaly: (T', C) score, NaN where there was no estimate.
+        stamps_s: (T',) seconds, on the prior's 30 Hz grid.
+        positions: (T', C, 22, 3) metres; NaN without an estimate.
+        sigma: (T', C, 22) metres, the predicted standard deviation along an axis.
+        anomaly: (T', C) score, NaN without an estimate.
         flagged: (T', C) whether it was flagged as an anomaly.
         rotations: (T', C, 22, 4) local, xyzw.
     """
@@ -63,7 +64,7 @@ class Cleaned:
 
 @lru_cache(maxsize=64)
 def available(settings: PriorSettings, delay: int) -> bool:
-    """Whether this variant can be run at this delay (up to twice HM-VAE's window)."""
+    """Whether this variant runs at this delay (up to twice HM-VAE's window)."""
     try:
         PriorPipeline(replace(settings, delay=delay))
     except ValueError:
@@ -76,11 +77,11 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
 
     Args:
         settings: the variant; its delay is overridden.
-        seen: (T, C, J, 3) metres, z up, NaN where missing. A clip is over after the last frame with a joint; a frame
-            without any joint in any clip is one that was lost.
+        seen: (T, C, J, 3) metres, z up, NaN where missing. A clip ends after its last frame with a joint. A frame
+            without any joint in any clip counts as lost.
         stamps_s: (T,) seconds of capture.
         delay: frames.
-        skeleton: of the J joints.
+        skeleton: layout of the J joints.
     """
     slots = SLOTS_A_CLIP * min(SIDE_BY_SIDE, seen.shape[1])
     prior = PriorPipeline(replace(settings, delay=delay, max_bodies=slots))
@@ -108,7 +109,7 @@ def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, ske
 def stream(
     prior: PriorPipeline, seen: Floats, stamps_s: Floats, skeleton: str = "smpl22", calibrated: bool = False
 ) -> Iterator[PoseClean]:
-    """What the prior answers to clips (T, C, J, 3) side by side, as the bodies 0 to C - 1 of one stream."""
+    """Return the prior's output for clips (T, C, J, 3) side by side, as the bodies 0 to C - 1 of one stream."""
     joints = ~missing(seen)
     any_seen = np.asarray(joints.any(axis=2))
     frames = len(seen) - any_seen[::-1].argmax(axis=0)

@@ -1,9 +1,10 @@
-"""What a result depends on, so that none outlives it: the pipeline's output, weights, and the code of the study.
+"""What a result depends on, so that outdated results are recognised: the pipeline's output, weights, and the study's
+code.
 
-What is measured of the product is its output, so a result records what the pipeline made of the bundled streams, not
-the code that made it: a refactoring that leaves the output as it was leaves every result as it was. Studies, baselines
-and what is trained are recorded by their definitions, whatever module they stand in, without comments, docstrings,
-annotations, and functions that only write tables and draw.
+Studies measure the product's output. So a result records the pipeline's output on the bundled streams, not its code: a
+refactoring that leaves the output unchanged leaves every result valid. Studies, baselines and training are recorded by
+their definitions, whatever module they are in. Comments, docstrings, annotations, and functions that only write tables
+or draw do not count.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from steadypose.prior.models.weights import WEIGHTS
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"
-"""Where the results lie that the README's tables are written from."""
+"""Folder of the results from which the README's tables are written."""
 
 CLEAN = ("pose/clean", "mixture weights", "occlusion weights", "hgvae weights", "posture weights")
-"""What `pose/clean` depends on with default settings, of what `ships`."""
+"""What `pose/clean` with default settings depends on, including the names in `ships`."""
 
 VARIANTS = (*CLEAN, "pose/clean, HM-VAE", "hmvae weights")
-"""The same of all variants of `benchmarks.product`: one refines with HM-VAE, which the default does not."""
+"""What all variants of `benchmarks.product` depend on. One of them refines with HM-VAE, which the default does not."""
 
 WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
 """What `pose/world` depends on."""
 
 COMPLETE = "complete"
-"""What `steadypose complete` makes of streams with a gap."""
+"""Output of `steadypose complete` on streams with a gap."""
 
 _WEIGHT_SETS = ("default", "kinect_v2")
-"""Those that ship; others may have been installed beside them."""
+"""Weight sets that ship; others may be installed beside them."""
 
 _PLUMBING = tuple(
     f"benchmarks.{name}" for name in ("evaluate", "figures", "output", "provenance", "report", "results", "stale")
@@ -49,17 +50,17 @@ _PLUMBING = tuple(
 """Modules that change no figure."""
 
 SAME_M = 1e-4
-"""Root mean square change of the output, metres, up to which it is the same: results are quoted to 0.1 mm, and floats
-differ between processors."""
+"""Largest root mean square change of an unchanged output, metres. Results are quoted to 0.1 mm, and floats differ
+between processors."""
 
 
 class UncommittedError(RuntimeError):
-    """What would be measured is in no commit; the message says what to do."""
+    """The code to be measured is not committed; the message says what to do."""
 
 
 @cache
 def ships() -> dict[str, str]:
-    """Digest of the weights of each model, by name: ``MODEL weights``."""
+    """Return the digest of each model's weights by name: ``MODEL weights``."""
     weights: dict[str, list[Path]] = {}
     for path in sorted(WEIGHTS.iterdir()):
         model, _, rest = path.name.partition("-")
@@ -79,7 +80,7 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def measured(depends_on: Sequence[str]) -> dict[str, Any]:
-    """What a result records: of each name an output, a digest of `ships`, or the code of a package such as
+    """Return what a result records for each name: an output, a digest of `ships`, or the digest of a package such as
     ``prior.fit``."""
     found = {}
     for name in depends_on:
@@ -94,8 +95,10 @@ def measured(depends_on: Sequence[str]) -> dict[str, Any]:
 
 @cache
 def package_digest(package: str) -> str:
-    """Of all definitions of a package or module of this project, which may be gone: moving one within it changes
-    nothing."""
+    """Return the digest of all definitions of a package or module of this project. The package may no longer exist.
+
+    Moving a definition within the package does not change the digest.
+    """
     path = PACKAGE.joinpath(*package.split("."))
     files = (
         sorted(path.rglob("*.py")) if path.is_dir() else [file] if (file := path.with_suffix(".py")).is_file() else []
@@ -104,7 +107,8 @@ def package_digest(package: str) -> str:
 
 
 def code(module: str) -> list[str]:
-    """``NAME DIGEST`` of every definition in a study's module and in those of `benchmarks` that it imports."""
+    """Return ``NAME DIGEST`` of every definition in a study's module and in the modules of `benchmarks` that it
+    imports."""
     todo, modules = [module], set[str]()
     if not _file_of(module).is_file():
         raise FileNotFoundError(f"{module}: expected a module of this project")
@@ -126,7 +130,7 @@ def _file_of(module: str) -> Path:
 
 @cache
 def definitions(path: Path) -> list[str]:
-    """``NAME DIGEST`` of every function, class and constant of a module that can change a figure."""
+    """Return ``NAME DIGEST`` of every function, class and constant of a module that can change a figure."""
     found = []
     for node in ast.parse(path.read_bytes()).body:
         match node:
@@ -147,7 +151,7 @@ def definitions(path: Path) -> list[str]:
 
 
 def _bare(node: ast.stmt) -> ast.stmt:
-    """Without docstrings, and without functions' annotations."""
+    """Return a definition without docstrings and without functions' annotations."""
     for part in ast.walk(node):
         if isinstance(body := getattr(part, "body", None), list):
             part.body = [line for line in body if not _is_text(line)]  # type: ignore[attr-defined]
@@ -164,15 +168,15 @@ def _is_text(node: ast.AST) -> bool:
 
 @cache
 def _known() -> frozenset[str]:
-    """``NAME DIGEST`` of every definition of `benchmarks`."""
+    """Return ``NAME DIGEST`` of every definition in `benchmarks`."""
     return frozenset(line for path in (PACKAGE / "benchmarks").rglob("*.py") for line in definitions(path))
 
 
 def stale(result: Mapping[str, Any]) -> list[str]:
-    """What has changed since a result was measured; nothing where it holds, or is frozen: a finished study, whose code
-    is gone from here and to be had at the commit that ``frozen`` names.
+    """Return what has changed since a result was measured; nothing if it is valid or frozen.
 
-    Results of before 2026-11-24 recorded settings and modules, if any, and no output.
+    A frozen result is of a finished study, whose code is only at the commit named by ``frozen``. Results from before
+    2026-11-24 recorded settings and modules, if any, and no output.
     """
     if "frozen" in result:
         return []
@@ -192,7 +196,7 @@ def _is_same(recorded: str | list[float], now: str | list[float]) -> bool:
 
 
 def require_committed(directory: Path) -> None:
-    """Refuse to fill `RESULTS` with what no commit can make again; to be asked before measuring.
+    """Refuse to write results to `RESULTS` that no commit can reproduce. Call it before measuring.
 
     Raises:
         UncommittedError: the checkout differs from its commit, in more than results and documents.
@@ -205,7 +209,8 @@ def require_committed(directory: Path) -> None:
 
 
 def machine() -> dict[str, str | int | float]:
-    """CPU, cores, memory, load, versions, and the commit that was measured ("-dirty" where it is `uncommitted`)."""
+    """Return CPU, cores, memory, load, versions, and the measured commit ("-dirty" if the checkout is
+    `uncommitted`)."""
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0,
@@ -221,7 +226,8 @@ def machine() -> dict[str, str | int | float]:
 
 
 def uncommitted() -> list[str]:
-    """Files that differ from the commit, except results and documents, which do not change what is measured."""
+    """Return the files that differ from the commit, except results and documents, which do not change what is
+    measured."""
     changed = _git("diff", "--name-only", "HEAD", "--", ".", ":!benchmarks/results", ":!docs", ":!*.md")
     return [] if changed == "unknown" else changed.split()
 

@@ -1,8 +1,8 @@
-"""Writes what was measured where people read it: tables between the README's markers, and all of them on one page.
+"""Writes the measured tables into the README, between its markers, and all of them onto one page.
 
-Where the README reads ``<!-- results:NAME -->``, the text up to ``<!-- /results -->`` is replaced by table NAME of
-``benchmarks/results/*.json``. What `stale.STALE` lists is marked, with its reason; a test holds that list against the
-code (`provenance.stale`).
+The text between ``<!-- results:NAME -->`` and ``<!-- /results -->`` is replaced by table NAME of
+``benchmarks/results/*.json``. Results listed in `stale.STALE` are marked with the reason. A test compares that list
+with the code (`provenance.stale`).
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ class Args:
     """Write the measured tables into the README and docs/results.md."""
 
     readme: Path = ROOT / "README.md"
-    """holds the markers"""
+    """File with the markers."""
     page: Path = ROOT / "docs" / "results.md"
-    """is written anew"""
+    """File that is written anew."""
     results: Path = RESULTS
-    """holds the JSON files"""
+    """Folder of the JSON files."""
 
 
 def markdown(table: Mapping[str, Any], result: Mapping[str, Any], reason: str | None = None) -> str:
-    """A table as Markdown, with its note, the command that makes it, the machine, and the reason if it is stale."""
+    """Format a table as Markdown, with its note, command and machine, and the reason if it is stale."""
     machine, command = result["machine"], result["command"]
     cells = [table["columns"], ["---", *["---:"] * (len(table["columns"]) - 1)], *table["rows"]]
     lines = [f"**{table['title']}**", ""]
@@ -60,10 +60,10 @@ def markdown(table: Mapping[str, Any], result: Mapping[str, Any], reason: str | 
 
 
 def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """The text with every block between markers replaced.
+    """Replace every block between markers.
 
     Raises:
-        KeyError: a marker names a table that no result holds.
+        KeyError: a marker names a table that no result has.
     """
     tables = {t["name"]: markdown(t, r, reasons.get(name)) for name, r in results.items() for t in r["tables"]}
 
@@ -77,7 +77,7 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[s
 
 
 def page(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """All tables, by study."""
+    """Return all tables, by study."""
     parts = [HOW]
     for name, result in results.items():
         parts.append(f"\n## {name.replace('_', ' ').capitalize()}\n")

@@ -1,4 +1,4 @@
-"""Results of a study: tables for people, figures for programs, in one JSON file beside the code."""
+"""Results of a study in one JSON file: tables to read, and figures for programs."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 READINGS = RESULTS / "test-readings.csv"
-"""Every time that the test split was scored. A split that is read often is one that things are chosen by: who changes
-something after a reading writes what into the last column."""
+"""Log of every scoring of the test split. A split that is read often is being used for choices: if you change something
+after a reading, write the change into the last column."""
 
 NONE = "–"
-"""What stands in a table where a method has no estimate."""
+"""Text of a table's cell where a method has no estimate."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a result. The first column is text, the others figures.
+    """A table of a result. The first column is text, the others are figures.
 
     Attributes:
-        name: of the markers that it is written between.
+        name: name in the markers between which the table is written.
         title: what is measured, with units.
         columns: headers.
         rows: cells, ready to print.
@@ -48,13 +48,13 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """What a study found.
+    """Result of a study.
 
     Attributes:
-        tables: for people; the first is printed first.
-        data: for programs.
-        figures: by name of the file.
-        wrong: what must not be, a line each; the command then fails.
+        tables: tables to read; the first is printed first.
+        data: figures for programs.
+        figures: plots by file name.
+        wrong: violated requirements, a line each; the command then fails.
     """
 
     tables: list[Table]
@@ -64,17 +64,17 @@ class Result:
 
 
 class Study(Protocol):
-    """The module of a study: it has a ``run`` from a `Bench` to a `Result`, too."""
+    """A study's module. It also has a function ``run`` from a `Bench` to a `Result`."""
 
     __name__: str
     DEPENDS_ON: Sequence[str]
-    """Names of what it measures, as of `provenance.measured`: when one of these changes, its results are stale."""
+    """Names of what it measures, as in `provenance.measured`. When one of these changes, its results are stale."""
 
 
 def show(table: Table, console: Console) -> None:
-    """Print a table: no figure is broken, and columns that do not fit into the console's width follow below.
+    """Print a table. No figure is broken; columns that exceed the console's width follow below.
 
-    Of rows all named as ``group: method`` the group is a line of its own above its methods.
+    If all rows are named ``group: method``, each group has a line of its own above its methods.
     """
     labels = [row[0].partition(": ") for row in table.rows]
     grouped = all(name for _, _, name in labels)
@@ -108,12 +108,13 @@ def show(table: Table, console: Console) -> None:
 
 
 def _width(table: Table, column: int) -> int:
-    """Characters that a column of figures needs: its longest cell, and the longest word of its header."""
+    """Return the width that a column of figures needs, characters: its longest cell or the longest word of its
+    header."""
     return max(len(text) for text in (*table.columns[column].split(), *(row[column] for row in table.rows)))
 
 
 def _blocks(table: Table, width: int) -> list[list[int]]:
-    """The columns of figures, in as many blocks as it takes for each to fit into ``width`` characters."""
+    """Split the columns of figures into blocks that each fit into ``width`` characters."""
     blocks: list[list[int]] = [[]]
     left = width
     for column in range(1, len(table.columns)):
@@ -137,7 +138,7 @@ def save(
     """Write ``NAME.json``: the command, the machine, what was measured, the tables, and ``data``.
 
     Raises:
-        UncommittedError: see `require_committed`, which is best asked before measuring.
+        UncommittedError: see `require_committed`, which you should call before measuring.
     """
     require_committed(directory)
     path = directory / f"{name}.json"
@@ -150,12 +151,12 @@ def save(
 
 
 def load(directory: Path = RESULTS) -> dict[str, dict[str, Any]]:
-    """All results by the study's name."""
+    """Return all results by the study's name."""
     return {path.stem: json.loads(path.read_text()) for path in sorted(directory.glob("*.json"))}
 
 
 def log_reading(study: str) -> None:
-    """Append a line to `READINGS`: the test split is about to be scored by this study, whatever becomes of it."""
+    """Append a line to `READINGS` before this study scores the test split, whether or not it completes."""
     now = machine()
     READINGS.parent.mkdir(parents=True, exist_ok=True)
     new = not READINGS.is_file()
@@ -167,7 +168,7 @@ def log_reading(study: str) -> None:
 
 
 def _nan_to_null(value: Any) -> Any:
-    """The same with None for NaN, which JSON does not have."""
+    """Return the value with None for NaN, which JSON does not have."""
     if isinstance(value, Mapping):
         return {key: _nan_to_null(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
