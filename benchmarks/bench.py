@@ -1,5 +1,7 @@
-"""What every study has in common: its surroundings, baselines and steadypose run over clips, and the same parameter
-search for every baseline: so many evaluations, on the same clips, by the same loss."""
+"""What all studies share: their settings, the baselines and steadypose run over clips, and one parameter search.
+
+The search is the same for every baseline: the same number of evaluations, the same clips and the same loss.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,8 @@ class Tuned:
     """Result of a parameter search.
 
     Attributes:
-        parameters: of the least loss.
-        tried: every point, with its figures.
+        parameters: parameters with the least loss.
+        tried: every evaluated point, with its figures.
     """
 
     parameters: Parameters
@@ -37,19 +39,20 @@ class Tuned:
 
 
 def loss(figures: Mapping[str, float]) -> float:
-    """What tuning minimises: position error, mm, and acceleration error, mm/frame², added."""
+    """Return the loss that tuning minimises: position error in mm plus acceleration error in mm/frame²."""
     return figures["position_mm"] + figures["acceleration_mm"]
 
 
 def search(
     space: Mapping[str, tuple[float, float]], evaluate: Callable[[Parameters], dict[str, float]], budget: int
 ) -> Tuned:
-    """Two thirds of the budget evenly over the space (Sobol), the rest in a quarter of its width around the best.
+    """Search parameters: two thirds of the budget evenly over the space (Sobol), the rest within a quarter of its width
+    around the best.
 
     Args:
-        space: lowest and highest of each parameter; logarithms are searched.
-        evaluate: parameters to figures, with ``position_mm`` and ``acceleration_mm`` among them.
-        budget: how often it is called. Without parameters, once.
+        space: range of each parameter, searched in its logarithm.
+        evaluate: maps parameters to figures, including ``position_mm`` and ``acceleration_mm``.
+        budget: number of evaluations; one if there are no parameters.
     """
     if not space:
         return Tuned({}, [evaluate({})])
@@ -77,7 +80,7 @@ if TYPE_CHECKING:
 
 
 DELAYS = (0, 2, 4, 8)
-"""Frames at 30 Hz at which methods are compared."""
+"""Delays at which methods are compared, frames at 30 Hz."""
 SEEDS = (0, 1, 2)
 """Seeds of networks trained here, and of random sampling."""
 RECURRENT = "GRU of the whole body"
@@ -85,14 +88,14 @@ RECURRENT = "GRU of the whole body"
 
 @dataclass(frozen=True)
 class Bench:
-    """Where a protocol runs.
+    """Settings of a study.
 
     Attributes:
-        quick: fewer clips, points and steps, to see that all works.
-        split: of prepared motion that is scored: ``val`` to choose by, ``test`` to report.
+        quick: use fewer clips, points and steps, to check that everything works.
+        split: split of the prepared motion to score: ``val`` to choose, ``test`` to report.
         mocap: folder with ui_prmd.npz, or None.
-        data: prepared.npz; where it does not exist, people of the project's own generator take its place.
-        progress: bars.
+        data: prepared.npz; if it does not exist, simulated people are used instead.
+        progress: progress bars.
     """
 
     quick: bool
@@ -111,15 +114,15 @@ class Bench:
 
     @property
     def budget(self) -> int:
-        """Evaluations that each baseline's search may spend, for each delay."""
+        """Number of evaluations in each baseline's search, for each delay."""
         return 6 if self.quick else 18
 
     def clips(self, frames: int = 90, most: int = 32) -> MotionClips:
-        """Motion to score."""
+        """Return the motion to score."""
         return self._motion(self.split, frames, min(most, 12) if self.quick else most)
 
     def training_clips(self) -> MotionClips:
-        """Training motion, of other people, for the baselines that learn."""
+        """Return training motion of other people, for the baselines that learn."""
         return self._motion("train", 90, 60 if self.quick else 1000)
 
     def _motion(self, split: str, frames: int, most: int) -> MotionClips:
@@ -129,7 +132,7 @@ class Bench:
 
     @cached_property
     def smoothnets(self) -> list[smoothnet.SmoothNet]:
-        """One of each seed, trained here and now."""
+        """Train a network for each seed."""
         motion = self.training_clips()
         steps = 100 if self.quick else 3000
         return [
@@ -139,30 +142,30 @@ class Bench:
 
     @cached_property
     def recurrent(self) -> recurrent.RecurrentDenoiser:
-        """The whole-body denoiser, trained here and now."""
+        """Train the whole-body denoiser."""
         track = partial(self.progress.track, description="recurrent denoiser")
         return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else recurrent.STEPS, 0, track)
 
 
 class Answer(NamedTuple):
-    """Of one method at one delay."""
+    """Output of one method at one delay."""
 
     method: str
     delay: int
-    stamps_s: Floats  # (T',): those of the frames, or where a method has a grid of its own, of that
+    stamps_s: Floats  # (T',), on the method's own grid if it has one, else those of the frames
     positions: Floats  # (T', C, 22, 3)
     parameters: Mapping[str, float]
     sigma: Floats | None = None  # (T', C, 22)
 
 
 class Methods(NamedTuple):
-    """What is compared.
+    """Methods to compare.
 
     Attributes:
-        baselines: those without training.
+        baselines: baselines without training.
         product: steadypose's variants.
         delays: frames.
-        networks: whether the baselines that are trained here take part.
+        networks: whether to include the baselines trained here.
     """
 
     baselines: Sequence[Baseline]
@@ -172,12 +175,12 @@ class Methods(NamedTuple):
 
     @classmethod
     def all(cls, bench: Bench, baselines: Sequence[Baseline] = BASELINES) -> Methods:
-        """These baselines, and every variant of steadypose."""
+        """Return these baselines and every variant of steadypose."""
         return cls(baselines, product.PRODUCT, bench.delays)
 
 
 def baselines_of(baselines: Sequence[Baseline], delays: Sequence[int]) -> Iterator[tuple[Baseline, int]]:
-    """Every baseline with every delay that it has."""
+    """Yield every baseline with each delay that it supports."""
     for baseline in baselines:
         for delay in delays if baseline.delays is None else baseline.delays:
             yield baseline, delay
@@ -191,7 +194,7 @@ def answers(
     title: str,
     methods: Methods | None = None,
 ) -> Iterator[Answer]:
-    """All methods over clips (T, C, 22, 3), each with the parameters found for it; a network once for each seed."""
+    """Run all methods over clips (T, C, 22, 3) with their tuned parameters; a network once for each seed."""
     methods = methods or Methods.all(bench)
     delays = methods.delays
 
@@ -236,7 +239,7 @@ def tune(
     baselines: Sequence[Baseline] = BASELINES,
     delays: Sequence[int] | None = None,
 ) -> dict[tuple[str, int], Tuned]:
-    """The same search for every baseline at every delay; ``evaluate`` gives the figures of a baseline's parameters."""
+    """Run the same search for every baseline at every delay; ``evaluate`` maps a baseline's parameters to figures."""
     every = list(baselines_of(baselines, bench.delays if delays is None else delays))
     return {
         (baseline.name, delay): search(baseline.space, partial(evaluate, baseline, delay), bench.budget)
@@ -246,7 +249,7 @@ def tune(
 
 
 def tuning_log(tuned: Mapping[tuple[str, int], Tuned]) -> list[dict[str, Any]]:
-    """What was tried, for the results file."""
+    """Return all evaluated points, for the results file."""
     return [
         {"method": name, "delay": delay, "best": found.parameters, "tried": found.tried}
         for (name, delay), found in tuned.items()
@@ -255,7 +258,7 @@ def tuning_log(tuned: Mapping[tuple[str, int], Tuned]) -> list[dict[str, Any]]:
 
 
 def over_seeds(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Records of one method, delay and condition but several seeds made one: numbers averaged, and their spread."""
+    """Merge the records of several seeds into one for each method, delay and condition: means and their spread."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for record in records:
         key = (record["method"], record["delay"], record.get("condition"))

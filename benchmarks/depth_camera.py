@@ -1,8 +1,8 @@
-"""A stereo depth camera: renders simulated people in a room, with the errors of stereo matching.
+"""Simulates a stereo depth camera: renders people in a room, with the errors of stereo matching.
 
-Errors are simulated on disparity, so that they grow with the square of the distance: spatially correlated noise,
-quantisation to a fraction of a pixel, bleeding edges (the matcher's window spans both sides), half-occlusion (pixels
-that only one of the two cameras sees), and holes without a match.
+Errors are simulated on disparity, so that they grow with the square of the distance. They are spatially correlated
+noise, quantisation to a fraction of a pixel, bleeding edges (the matcher's window spans both sides), half-occlusion
+(pixels that only one of the two cameras observes), and holes without a match.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class Stereo:
     """A depth camera and its errors.
 
     Attributes:
-        width, height: pixels of the depth image.
-        focal: pixels.
-        baseline: metres between the two cameras.
-        noise: pixels of disparity, standard deviation.
-        step: pixels of disparity, quantisation.
-        window: pixels, side of the matcher's window.
+        width, height: size of the depth image, pixels.
+        focal: focal length, pixels.
+        baseline: distance between the two cameras, metres.
+        noise: standard deviation of disparity, pixels.
+        step: quantisation of disparity, pixels.
+        window: side of the matcher's window, pixels.
         holes: share of the image without a match.
     """
 
@@ -44,24 +44,24 @@ class Stereo:
 
     @property
     def intrinsics(self) -> Floats:
-        """(3, 3), without distortion."""
+        """Camera matrix (3, 3), without distortion."""
         centre = (self.width - 1) / 2, (self.height - 1) / 2
         return np.array([[self.focal, 0.0, centre[0]], [0.0, self.focal, centre[1]], [0.0, 0.0, 1.0]])
 
     def project(self, points: Floats) -> Floats:
-        """(..., 2) pixels of points (..., 3) in the optical frame."""
+        """Project points (..., 3) in the optical frame to pixels (..., 2)."""
         image = points @ self.intrinsics.T
         return image[..., :2] / image[..., 2:]
 
 
 def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
-    """(H, W) metres of depth of an empty room.
+    """Return the depth (H, W) of an empty room, metres.
 
     Args:
         camera: the camera.
-        height: metres of the camera above the floor.
-        pitch: radians by which it looks down.
-        wall: metres from the camera to the wall that it faces.
+        height: height of the camera above the floor, metres.
+        pitch: angle by which it looks down, radians.
+        wall: distance from the camera to the wall that it faces, metres.
     """
     rays = _rays(camera)
     ahead = np.array([0.0, -np.sin(pitch), np.cos(pitch)])  # level, optical frame
@@ -72,10 +72,11 @@ def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
 
 
 def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: Floats) -> Floats:
-    """Depth of people in front of a background, without errors.
+    """Render the depth of people in front of a background, without errors.
 
     Args:
-        people: of each, joints (22, 3) metres in the optical frame, and bones (22, 3), which say how stout the limbs.
+        people: for each, joints (22, 3) metres in the optical frame, and bones (22, 3), which determine the limbs'
+            radii.
         camera: the camera.
         background: (H, W) metres.
 
@@ -101,18 +102,18 @@ def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: 
 
 
 def corrupt(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """(H, W) millimetres as a stereo camera gives them, 0 where it has none, from depth (H, W) in metres."""
-    import cv2  # of an extra: who renders without errors does without
+    """Add stereo errors to depth (H, W) in metres; returns millimetres, 0 where there is no measurement."""
+    import cv2  # from an extra, which rendering without errors does not need
 
     disparity = camera.focal * camera.baseline / depth
-    # the matcher's window takes the nearer side here, both sides there
+    # the matcher's window takes the nearer side on one side of an edge and both on the other
     half = camera.window // 2
     fat, mixed = cv2.dilate(disparity, np.ones((half + 1, half + 1))), cv2.blur(disparity, (half, half))
     mood = _texture(depth.shape, 4.0, rng)
     seen = np.where(mood > 0.3, fat, np.where(mood < -0.6, mixed, disparity))
     seen += camera.noise * (0.8 * _texture(depth.shape, 2.0, rng) + 0.6 * rng.standard_normal(depth.shape))
     seen = np.round(seen / camera.step) * camera.step
-    # seen by the left camera only: something to its right hides it from the right one
+    # observed by the left camera only: hidden from the right one by something to the right
     column = np.arange(camera.width) - disparity
     ahead = np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(depth.shape, bool)
@@ -126,14 +127,14 @@ def corrupt(depth: Floats, camera: Stereo, rng: np.random.Generator) -> NDArray[
 
 @cache
 def _rays(camera: Stereo) -> Floats:
-    """(H, W, 3) with z = 1."""
+    """Return the rays (H, W, 3) with z = 1."""
     x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
     return pixels @ np.linalg.inv(camera.intrinsics).T
 
 
 def _texture(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats:
-    """Noise of unit variance that pixels within about ``size`` share."""
+    """Return noise of unit variance, correlated over about ``size`` pixels."""
     import cv2
 
     noise = cv2.GaussianBlur(rng.standard_normal(shape), (0, 0), size)
@@ -141,12 +142,13 @@ def _texture(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> F
 
 
 def _capsule(rays: Floats, start: Floats, end: Floats, radius: float) -> Floats:
-    """Depth (...) at which rays (..., 3), from the origin and with z = 1, enter a capsule; infinite where they miss."""
+    """Return the depth (...) at which rays (..., 3), from the origin with z = 1, enter a capsule; infinite if they
+    miss."""
     axis = end - start
     along, length = rays @ axis, axis @ axis
     best = np.full(rays.shape[:-1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # the cylinder: what is left of ray and centre across the axis
+        # the cylinder: the components of ray and centre across the axis
         a = (rays * rays).sum(-1) * length - along**2
         b = length * (rays @ -start) - along * (axis @ -start)
         c = length * (start @ start) - (axis @ -start) ** 2 - radius**2 * length

@@ -29,20 +29,20 @@ def evaluate(
     data: Path = Path("data/prepared.npz"),
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
 ) -> int:
-    """Measure steadypose against its tuned baselines: choose on the split 'val', report 'test'.
+    """Measure steadypose against its tuned baselines. Choose on the split 'val' and report 'test'.
 
-    Figures, tables and pictures of 'test', and of what has no split, go to benchmarks/results, if what is measured is
-    committed; others go to the folder that --out names, or nowhere. Every reading of 'test' is a line of
+    Figures, tables and plots of 'test', and of studies without a split, are written to benchmarks/results, if the code
+    is committed. Others are written to the folder of --out, if any. Every reading of 'test' is logged in
     benchmarks/results/test-readings.csv.
 
     Args:
-        study: what to measure, or 'all' that is not of a whole system (latency, scale, restart, soak, events).
-        split: of the prepared motion that is scored. Kinect, MediaPipe and force plates have none.
-        quick: a few clips and points, to see that all works.
+        study: what to measure, or 'all' studies except those of the whole system (latency, scale, restart, soak,
+            events).
+        split: split of the prepared motion to score. Kinect, MediaPipe and force plates have none.
+        quick: use a few clips and points, to check that everything works.
         mocap: folder with ui_prmd.npz, mediapipe_pose.npz and contacts_grf.npz, for the studies of these sensors;
-            without it, they are left out of 'all'.
-        data: prepared motion, as 'steadypose prepare' wrote it; without it, people of the project's own simulator
-            stand in.
+            without it, 'all' leaves them out.
+        data: prepared motion, written by 'steadypose prepare'; without it, simulated people are used instead.
         out: folder to write to.
     """
     if (needed := _missing(study, mocap, data)) is not None:

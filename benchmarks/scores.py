@@ -1,4 +1,4 @@
-"""Scores of a method over clips: one number a clip, means over people with their intervals, and tables of them."""
+"""Scores of a method over clips: one number per clip, means over people with their intervals, and tables."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ LIMBS: Mapping[str, NDArray[np.intp]] = {
 _BONES = tuple((joint, parent) for joint, parent in enumerate(PARENTS) if parent >= 0)
 
 MPS2 = FPS**2 * 1e-3
-"""m/s² in a mm/frame²."""
+"""Acceleration in m/s² of one mm/frame²."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """One number a clip, (C,), NaN where a clip has nothing of the kind."""
+    """One number per clip, (C,), NaN where a clip has no such joint."""
 
     position: Floats  # metres: MPJPE
-    seen: Floats  # metres, of the joints that were given
-    hidden: Floats  # metres, of those that were not
-    aligned: Floats  # metres: PA-MPJPE, every frame turned, moved and scaled
+    seen: Floats  # metres, of observed joints
+    hidden: Floats  # metres, of hidden joints
+    aligned: Floats  # metres: PA-MPJPE, each frame rotated, translated and scaled
     acceleration: Floats  # metres/frame²
     acceleration_error: Floats  # metres/frame²
     variation: Floats  # of bone lengths, relative
-    answered: Floats  # share of the hidden joints for which there was an answer
+    answered: Floats  # share of the hidden joints that have an estimate
     limbs: Mapping[str, Floats]  # metres
 
 
@@ -64,11 +64,11 @@ def score(answer: Floats, truth: Floats, hidden: NDArray[np.bool_], align: bool 
 
 
 def figures(scores: Scores, people: NDArray[np.str_] | None = None) -> dict[str, Any]:
-    """Means over clips: mm, mm/frame², m/s², per cent.
+    """Return means over clips: mm, mm/frame², m/s², per cent.
 
     Args:
-        scores: of C clips.
-        people: (C,) who moves, for the 95 % intervals over people of those that decide.
+        scores: scores of C clips.
+        people: (C,) person of each clip, for the 95 % intervals over people of the main figures.
     """
     deciding = {"position": scores.position, "hidden": scores.hidden, "acceleration": scores.acceleration_error}
     intervals = {} if people is None else {f"{name}_ci_mm": ends_mm(v, people) for name, v in deciding.items()}
@@ -89,7 +89,7 @@ def figures(scores: Scores, people: NDArray[np.str_] | None = None) -> dict[str,
 
 
 def ends_mm(values: Floats, people: NDArray[np.str_]) -> list[float] | None:
-    """95 % interval over people of the mean of (C,) metres, mm; None where nothing is known."""
+    """Return the 95 % interval over people of the mean of (C,) metres, mm; None where there is no value."""
     found = interval(values, people)
     return [round(end * 1e3, 3) for end in (found.low, found.high)] if found.people else None
 
@@ -97,7 +97,8 @@ def ends_mm(values: Floats, people: NDArray[np.str_]) -> list[float] | None:
 def pivot(
     records: Sequence[Mapping[str, Any]], column: str, figure: str, name: str, title: str, note: str, digits: int = 1
 ) -> Table:
-    """A table with a row for each method and delay, and a column for each value of ``column``; text stays as it is."""
+    """Build a table with a row for each method and delay, and a column for each value of ``column``; text is kept as it
+    is."""
     columns = list(dict.fromkeys(record[column] for record in records))
     rows: dict[tuple[str, int], dict[str, str]] = {}
     for record in records:
@@ -117,12 +118,12 @@ def pivot(
 
 
 def _order(records: Sequence[Mapping[str, Any]], row: tuple[str, int]) -> tuple[int, int]:
-    """Methods as they were run, each by delay."""
+    """Order methods as they were run, each by delay."""
     return list(dict.fromkeys(record["method"] for record in records)).index(row[0]), row[1]
 
 
 def _mean(values: Floats) -> Floats:
-    """Mean over the frames and joints of every clip: (T, C, J) to (C,)."""
+    """Return the mean over the frames and joints of every clip: (T, C, J) to (C,)."""
     known = np.isfinite(values)
     total, count = np.where(known, values, 0.0).sum(axis=(0, 2)), known.sum(axis=(0, 2))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -142,7 +143,7 @@ def _over_clips(values: Floats) -> float:
 
 
 _LEAST = 1e-6
-"""metres; a ratio to no error at all is one to this"""
+"""Lower bound of the errors in a ratio, metres."""
 
 
 def source_table(
@@ -152,14 +153,14 @@ def source_table(
     clips: MotionClips,
     baseline: str,
 ) -> Table:
-    """A column a source, the mean over people, and its ratio to a baseline.
+    """Build a table with a column for each source, the mean over people, and its ratio to a baseline.
 
     Args:
-        name: of the table.
+        name: name of the table.
         title: what is measured, in millimetres.
-        errors: by condition and method, (C,) metres, NaN of a clip without such an error.
-        clips: whose these are.
-        baseline: the method of which the last column is the ratio, in the same condition.
+        errors: by condition and method, (C,) metres, NaN for a clip without such an error.
+        clips: the clips.
+        baseline: method whose error is the denominator of the last column, in the same condition.
     """
     sources = list(dict.fromkeys(clips.data_set.tolist()))
     rows = []

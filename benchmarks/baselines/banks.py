@@ -1,12 +1,15 @@
-"""Baselines without a setting: multiple-model estimates of fixed-lag smoothers, of joints and of the whole body.
+"""Baselines without a parameter: multiple-model estimates of fixed-lag smoothers, per joint and of the whole body.
 
-(Bar-Shalom, Li and Kirubarajan 2001, section 11.6.) Of joints: a smoother's weight is the likelihood of its innovations
-over the last 0.3 s. The measurement noise is estimated from third differences, in which motion is small: their median
-over the last second, half of it (in logarithm) shared by the joints of a body. Of the whole body: eight smoothers over
-modes instead of joints, eigenvectors of the covariance of joints' accelerations, learned once from other people's
-motion (`prior.models.mixture.tracks`). In white noise it has 0.84 to 0.93 of the other's error, whoever moves; its
-smoothers are the product's own (`prior.models.mixture.bank`), which falls back to the same, but for an estimate of the
-noise that modes share where it is white.
+Both follow Bar-Shalom, Li and Kirubarajan 2001, section 11.6.
+
+Per joint, a smoother's weight is the likelihood of its innovations over the last 0.3 s. The measurement noise is
+estimated from third differences, in which motion is small: their median over the last second, half of it (in logarithm)
+shared by the joints of a body.
+
+Of the whole body, eight smoothers run over modes instead of joints. The modes are eigenvectors of the covariance of
+joint accelerations, learned once from other people's motion (`prior.models.mixture.tracks`). In white noise it has 0.84
+to 0.93 of the other's error, for all people. Its smoothers are the product's own (`prior.models.mixture.bank`). The
+product falls back to the same estimate, except for the noise shared by modes where it is white.
 """
 
 from __future__ import annotations
@@ -29,19 +32,19 @@ from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 JOINT_DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
-"""Process densities of joints' smoothers, m²/s³."""
+"""Process densities of the joints' smoothers, m²/s³."""
 
 _RECENT, _NOISE_FRAMES = 9, 30
 _MIN_NOISE, _FIRST_NOISE = 1e-4, 0.01
-"""metres, lower bound of the estimated noise, and its value before there are four observations"""
+"""Lower bound of the estimated noise, and its value before the fourth observation, metres."""
 _MEDIAN_NORM = 1.538
 """Median length of a normal vector in space with a standard deviation of 1 along each axis."""
 _THIRD = np.sqrt(20.0)
-"""Standard deviation of the third difference of white noise."""
+"""Standard deviation of the third difference of white noise of standard deviation 1."""
 
 
 def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Each frame's estimate, given the measurements up to ``delay`` frames later (those there are, at the end).
+    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
 
     Args:
         seen: (T, ..., J, 3) metres, NaN where missing; J joints of a body.
@@ -61,7 +64,7 @@ def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def noise_found(seen: Floats) -> Floats:
-    """(T, ..., J) metres along an axis, noise estimated from the input up to each frame."""
+    """Estimate the noise along an axis from the input up to each frame, (T, ..., J) metres."""
     third = np.full(seen.shape[:-1], np.nan)
     third[3:] = np.linalg.norm(np.diff(seen, n=3, axis=0), axis=-1)
     padded = np.concatenate([np.full((_NOISE_FRAMES - 1, *third.shape[1:]), np.nan), third])
@@ -80,7 +83,7 @@ def noise_found(seen: Floats) -> Floats:
 
 
 def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Each frame's estimate, given the measurements up to ``delay`` frames later (those there are, at the end).
+    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
 
     Args:
         seen: (T, ..., 22, 3) metres, canonical joints of a body, NaN where missing.
@@ -88,7 +91,7 @@ def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
         delay: frames.
 
     Raises:
-        ValueError: other joints; the compiled loops would write past the ends of their arrays.
+        ValueError: there are other joints; the compiled loops would write past the ends of their arrays.
     """
     if seen.shape[-2:] != (len(PARENT), 3):
         raise ValueError(f"expected (..., {len(PARENT)}, 3) canonical joints of a body, got {seen.shape}")
@@ -98,7 +101,7 @@ def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
     experts, features = np.empty((bodies, joints, EXPERTS, 3)), np.empty((bodies, joints, FEATURES), np.float32)
     scale, gap, between = np.empty(bodies), np.empty((bodies, joints)), np.empty((bodies, joints))
 
-    unknown = np.zeros(bodies)  # of the noise, whether it is white
+    unknown = np.zeros(bodies)  # whether the noise is white is unknown
 
     def answer(count: int, back: int) -> None:
         describe(bank, count, back, PARENT, unknown, experts, features, scale, gap, between)

@@ -1,9 +1,10 @@
-"""Baselines for hidden joints that know the body: held in the body frame, and one Gaussian over training poses.
+"""Baselines for hidden joints that use the whole body: held in the body frame, and one Gaussian over training poses.
 
-Held: each joint keeps its place beside the nearest joint that is observed, turned with the trunk. Gaussian: poses are
-about the root, in the frame of the body's heading, and what is hidden is at the conditional mean E[h | s] = m_h + C_hs
-C_ss^-1 (s - m_s) (Bishop, Pattern Recognition and Machine Learning, 2006, equation 2.96), each frame by itself: what
-linear correlation alone knows of a body.
+Held: each joint keeps its offset from the nearest observed joint, rotated with the trunk.
+
+Gaussian: poses are relative to the root, in the frame of the body's heading. Hidden joints are at the conditional mean
+E[h | s] = m_h + C_hs C_ss^-1 (s - m_s) (Bishop, Pattern Recognition and Machine Learning, 2006, equation 2.96), each
+frame separately. This is what linear correlation alone knows of a body.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "sho
 
 
 def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """The input; a hidden joint keeps its last offset, turned with the trunk, from the nearest visible joint: the one
-    fewest bones away and, of several, nearest in space. With no visible joint, all are held. Of a joint never seen the
-    offset is that in a generic adult who stands with the arms down.
+    """Hold hidden joints in the body frame; observed joints are returned as they are.
+
+    A hidden joint keeps its last offset, rotated with the trunk, from the nearest visible joint: the one with the
+    fewest bones between them and, of several, the nearest in space. Without any visible joint, all are held. A joint
+    never observed has the offset of a generic adult who stands with the arms down.
 
     Args:
         seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
@@ -29,7 +32,7 @@ def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
     """
     answers = seen.copy()
     clips, joints = seen.shape[1:3]
-    # the pose as it was answered when each joint was last seen; of one never seen, in the last frame
+    # the output pose when each joint was last observed; for a joint never observed, of the last frame
     then = np.tile(_standing(), (clips, joints, 1, 1))
     never = np.ones((clips, joints), dtype=bool)
     for t, frame in enumerate(seen):
@@ -48,7 +51,7 @@ def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def _standing() -> Floats:
-    """(22, 3) metres: `REST_POSITIONS` with the arms down."""
+    """Return `REST_POSITIONS` with the arms down, (22, 3) metres."""
     pose = np.array(REST_POSITIONS)
     for side in ("left", "right"):
         arm, shoulder = [J[f"{side}_elbow"], J[f"{side}_wrist"]], pose[J[f"{side}_shoulder"]]
@@ -57,7 +60,7 @@ def _standing() -> Floats:
 
 
 def _turned(was: Floats, now: Floats) -> Floats:
-    """(N, 3, 3) how hips and shoulders, those seen in both, have turned about z from one pose (N, 22, 3) to another."""
+    """Return the rotation about z of hips and shoulders observed in both poses (N, 22, 3), (N, 3, 3)."""
     before, after = np.zeros((len(was), 2)), np.zeros((len(was), 2))
     for left, right in _ACROSS:
         a, b = (pose[:, left, :2] - pose[:, right, :2] for pose in (was, now))
@@ -69,14 +72,14 @@ def _turned(was: Floats, now: Floats) -> Floats:
 
 
 RIDGE = 1e-6
-"""m², added to variances along each axis: 1 mm, so that joints that a bone ties to each other can be solved for."""
+"""Regularisation of the variances along each axis, m²: 1 mm, so that joints tied by a bone can be solved for."""
 
 _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
 _ROOT = J["pelvis"]
 
 
 class ConditionalGaussian:
-    """The mean and covariance of poses (N, 22, 3), metres, z up, all of their joints seen."""
+    """Mean and covariance of complete poses (N, 22, 3), metres, z up."""
 
     def __init__(self, poses: Floats) -> None:
         x = ((poses - poses[:, _ROOT, None]) @ yaw_matrix(facing(poses))).reshape(len(poses), -1)
@@ -84,8 +87,11 @@ class ConditionalGaussian:
         self.covariance = np.cov(x, rowvar=False, bias=True) + RIDGE * np.eye(x.shape[1])
 
     def __call__(self, seen: Floats, yaw: Floats | None = None) -> Floats:
-        """Poses (..., 22, 3) metres with what was hidden (NaN) at its conditional mean; where the root is hidden, or
-        any of hips and shoulders and the heading is not given as ``yaw`` (...) radians, as they were."""
+        """Fill hidden joints (NaN) of poses (..., 22, 3), metres, with their conditional mean.
+
+        Poses stay as they are if the root is hidden, or if a hip or shoulder is hidden and the heading is not given as
+        ``yaw`` (...), radians.
+        """
         poses = seen.reshape(-1, 22, 3).copy()
         known = np.isfinite(poses).all(axis=-1)
         headings = facing(poses) if yaw is None else np.broadcast_to(yaw, seen.shape[:-2]).ravel()
@@ -104,7 +110,9 @@ class ConditionalGaussian:
 
 
 def facing(poses: Floats) -> Floats:
-    """(...) radians about z, of poses (..., 22, 3): the normal of the line from the right hip and shoulder to the left,
-    as what is hidden and how the pelvis is turned are not known."""
+    """Return the heading (...) of poses (..., 22, 3), radians about z.
+
+    It is the normal of the line from the right hip and shoulder to the left, because the pelvis' rotation is unknown.
+    """
     across = np.sum([poses[..., left, :] - poses[..., right, :] for left, right in _ACROSS], axis=0)
     return np.arctan2(-across[..., 0], across[..., 1])

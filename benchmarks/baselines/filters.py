@@ -1,8 +1,8 @@
-"""Filters that are freely available, as baselines.
+"""Freely available filters as baselines.
 
-A baseline takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps, and gives
-each frame's estimate as it stands ``delay`` frames later; at the end of a clip, with the frames there are. All use the
-real time between frames, where time enters at all.
+A baseline takes clips side by side, (T, ..., 3) metres with NaN where a joint is missing, and their stamps. It returns
+each frame's estimate as of ``delay`` frames later, or as of the end of the clip. All use the real time between frames,
+if they use time at all.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 OFFLINE = -1
-"""The delay of a method that needs the whole recording."""
+"""Delay of a method that needs the whole recording."""
 
-_HAMPEL_HALF = 5  # frames to either side, as far as they are known by then
-_HAMPEL_FLOOR = 0.005  # metres: in a still body, a spread of nothing would make every observation an outlier
+_HAMPEL_HALF = 5  # frames to either side, as far as they are available
+_HAMPEL_FLOOR = 0.005  # metres: without it, a still body has no spread and every observation would be an outlier
 _GAUSSIAN_PAST = 12  # frames
 _VELOCITY_CUTOFF_HZ = 1.0  # of the One-Euro filter
-_MEASUREMENT_SIGMA = 0.02  # metres, as `fixed_lag` has it
+_MEASUREMENT_SIGMA = 0.02  # metres, as in `fixed_lag`
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Baseline:
     """A method and the range of its parameters.
 
     Attributes:
-        name: in tables.
-        run: (seen, stamps_s, delay, **parameters) to answers of seen's shape.
-        delays: those that it has; None for any.
-        space: lowest and highest of each parameter, searched evenly in its logarithm.
-        whole_body: it takes the 22 canonical joints, and no choice of them.
+        name: name in tables.
+        run: maps (seen, stamps_s, delay, **parameters) to estimates of seen's shape.
+        delays: supported delays; None for any.
+        space: range of each parameter, searched evenly in its logarithm.
+        whole_body: whether it needs all 22 canonical joints.
     """
 
     name: str
@@ -51,23 +51,23 @@ class Baseline:
 
 
 def missing(seen: Floats) -> NDArray[np.bool_]:
-    """(T, ...) of (T, ..., 3)."""
+    """Return which joints of (T, ..., 3) are missing, (T, ...)."""
     return np.asarray(~np.isfinite(seen).all(axis=-1))
 
 
 def raw(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """As it came."""
+    """Return the input."""
     return seen
 
 
 def hold_last(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """The input; a missing joint is held at its last position."""
+    """Return the input; hold a missing joint at its last position."""
     return np.take_along_axis(seen, _last_seen(seen)[..., None], axis=0)
 
 
 def interpolate(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """The input; a missing joint is interpolated linearly if its next observation is at most ``delay`` frames away, and
-    otherwise held."""
+    """Return the input; interpolate a missing joint linearly if its next observation is at most ``delay`` frames away,
+    otherwise hold it."""
     frames = np.arange(len(seen)).reshape(-1, *[1] * (seen.ndim - 2))
     gone = missing(seen)
     last = _last_seen(seen)
@@ -81,10 +81,10 @@ def interpolate(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
 
 
 def one_euro(seen: Floats, stamps_s: Floats, delay: int, min_cutoff_hz: float, beta: float) -> Floats:
-    """The One-Euro filter (Casiez, Roussel and Vogel, CHI 2012): the cut-off rises by ``beta`` Hz per m/s.
+    """Apply the One-Euro filter (Casiez, Roussel and Vogel, CHI 2012): the cut-off rises by ``beta`` Hz per m/s.
 
-    The speed is the norm of the joint's filtered velocity, so the result does not depend on how the axes lie. A missing
-    joint is held; the next measurement of it is weighted by the time since its last.
+    The speed is the norm of the joint's filtered velocity, so the result does not depend on the axes. A missing joint
+    is held; its next measurement is weighted by the time since its last.
     """
     estimates = np.empty_like(seen)
     previous, estimate, velocity = np.full_like(seen[0], np.nan), np.full_like(seen[0], np.nan), np.zeros_like(seen[0])
@@ -104,30 +104,33 @@ def one_euro(seen: Floats, stamps_s: Floats, delay: int, min_cutoff_hz: float, b
 
 
 def _weight(cutoff_hz: Floats | float, step_s: Floats) -> Floats:
-    """Weight of the newest sample in an exponential filter (One-Euro paper, equation 5)."""
+    """Return the weight of the newest sample in an exponential filter (One-Euro paper, equation 5)."""
     return 1.0 / (1.0 + 1.0 / (2 * np.pi * cutoff_hz * step_s))
 
 
 def constant_velocity(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
-    """Kalman filter of constant velocity; with a delay, its fixed-lag RTS smoother."""
+    """Apply a constant-velocity Kalman filter; with a delay, its fixed-lag RTS smoother."""
     return fixed_lag(seen, stamps_s, delay, 2, density)
 
 
 def constant_velocity_by_joint(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
-    """The same with a density for each joint, as joints' accelerations differ in training motion; the mean is set."""
-    sigma = _MEASUREMENT_SIGMA / np.sqrt(np.diag(body_covariance()))  # the ratio of density and noise is what counts
+    """Apply the constant-velocity filter with a density for each joint, from joint accelerations in training motion;
+    their mean is ``density``."""
+    sigma = _MEASUREMENT_SIGMA / np.sqrt(np.diag(body_covariance()))  # only the ratio of density to noise matters
     noise = np.broadcast_to(sigma, seen.shape[:-1])
     return smooth(seen, stamps_s, delay, 2, density, noise).positions.reshape(seen.shape)
 
 
 def constant_acceleration(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
-    """Kalman filter of constant acceleration; with a delay, its fixed-lag RTS smoother."""
+    """Apply a constant-acceleration Kalman filter; with a delay, its fixed-lag RTS smoother."""
     return fixed_lag(seen, stamps_s, delay, 3, density)
 
 
 def gaussian_hampel(seen: Floats, stamps_s: Floats, delay: int, sigma_s: float, threshold: float) -> Floats:
-    """Mean of the frames around, weighted by a Gaussian of ``sigma_s`` seconds, cut off ``delay`` frames ahead, of
-    what a Hampel filter has cleared of outliers (Pearson et al. 2016)."""
+    """Average the surrounding frames, after a Hampel filter has removed outliers (Pearson et al. 2016).
+
+    Weights are a Gaussian of ``sigma_s`` seconds, cut off ``delay`` frames ahead.
+    """
     cleared = _hampel(seen, delay, threshold)
     total, weights = np.zeros_like(cleared), np.zeros(seen.shape[:-1])
     for shift in range(-_GAUSSIAN_PAST, delay + 1):
@@ -141,7 +144,8 @@ def gaussian_hampel(seen: Floats, stamps_s: Floats, delay: int, sigma_s: float, 
 
 
 def butterworth(seen: Floats, stamps_s: Floats, delay: int, cutoff_hz: float) -> Floats:
-    """Second-order Butterworth, forwards and backwards over the whole clip, gaps interpolated: offline."""
+    """Apply a second-order Butterworth filter forwards and backwards over the whole clip, gaps interpolated:
+    offline."""
     answers = np.full(seen.shape, np.nan)
     filled = interpolate(seen, stamps_s, OFFLINE).reshape(len(seen), -1)
     flat = answers.reshape(len(seen), -1)
@@ -170,22 +174,22 @@ BASELINES: tuple[Baseline, ...] = (
     Baseline("whole-body bank", whole_body_bank, whole_body=True),
     Baseline("Butterworth, offline", butterworth, (OFFLINE,), {"cutoff_hz": (0.5, 12.0)}),
 )
-"""Those without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""
+"""Baselines without training. With a delay, a Kalman filter is the fixed-lag RTS smoother of its model."""
 
 FILTERS: tuple[Baseline, ...] = tuple(
     baseline for baseline in BASELINES if baseline.run not in (hold_last, interpolate, beside)
 )
-"""Where every joint is always given, there are no gaps to fill."""
+"""Baselines for studies without missing joints: those that do more than fill gaps."""
 
 
 def _last_seen(seen: Floats) -> NDArray[np.intp]:
-    """(T, ...) the frame of each joint's last observation, 0 before the first."""
+    """Return the frame of each joint's last observation (T, ...), 0 before the first."""
     frames = np.arange(len(seen)).reshape(-1, *[1] * (seen.ndim - 2))
     return np.maximum.accumulate(np.where(missing(seen), 0, frames))
 
 
 def _overlap(frames: int, shift: int) -> tuple[slice, slice]:
-    """The frames t for which t + shift is one too, and these."""
+    """Return the slices of frames t + shift and of frames t for which both exist."""
     start, end = max(0, -shift), max(0, min(frames, frames - shift))
     return slice(start, end), slice(start + shift, max(0, end + shift))
 
@@ -204,7 +208,7 @@ def _hampel(seen: Floats, delay: int, threshold: float) -> Floats:
 
 
 def _median(values: Floats) -> Floats:
-    """Median over the first axis without NaN; sorting is many times faster than numpy's nanmedian."""
+    """Return the median over the first axis without NaN; sorting is many times faster than numpy's nanmedian."""
     ordered = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)
     low, high = np.maximum(count - 1, 0) // 2, count // 2

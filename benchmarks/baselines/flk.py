@@ -1,11 +1,12 @@
 """FLK as a baseline: a Kalman filter of every coordinate, with a recurrent network as motion model, and constant bones.
 
-After Martini, Boldo and Bombieri, "FLK: A filter with learned kinematics for real-time 3D human pose estimation", in
-Signal Processing, 2024, and its public code. A GRU gives the next pose from filtered ones; it is trained on motion as
-it is. A joint's speed sets how far its measurement is trusted: a slow one is taken as it is, a missing one predicted.
-Limbs keep their lengths once these are known, and a low pass follows. Different here: all 22 joints are predicted, as
-what each moves, about the pelvis and in the frame of the hips, and by one layer of 256 units, as of the other
-recurrent baseline. It has no delay.
+After Martini, Boldo and Bombieri, "FLK: A filter with learned kinematics for real-time 3D human pose estimation",
+Signal Processing, 2024, and its public code. A GRU predicts the next pose from filtered ones; it is trained on
+uncorrupted motion. A joint's speed sets how far its measurement is trusted: a slow one is taken as it is, a missing one
+is predicted. Limbs keep their lengths once these are known. A low-pass filter follows. It has no delay.
+
+Differences here: the displacements of all 22 joints are predicted, about the pelvis and in the frame of the hips, by
+one layer of 256 units, as in the other recurrent baseline.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.timing.rate import FPS
 
 SPACE = {"alpha": (1e-3, 10.0), "theta": (0.05, 0.99), "kept": (0.5, 1.0)}
-"""What is tuned, as `filtered` names it. The authors' values: 0.01, 0.75, 0.99."""
+"""Parameters that are tuned, named as in `filtered`. The authors' values are 0.01, 0.75 and 0.99."""
 
 LEAST_FRAMES, MOST_SPREAD = 20, 0.02
-"""A bone's length is known after more frames than this, if its standard deviation is less than this; metres."""
+"""A bone's length counts as known after more than this many frames, if its standard deviation is below this; metres."""
 
 SAME_LENGTH = 0.01
-"""Deviation of a bone's length that is left; a fraction."""
+"""Deviation of a bone's length that is not corrected, as a fraction."""
 
 _LIMBS = [J[f"{side}_{part}"] for part in ("elbow", "wrist", "knee", "ankle", "foot") for side in ("left", "right")]
 _PARENTS = [PARENTS[joint] for joint in _LIMBS]
@@ -37,7 +38,8 @@ _JOINTS, _WIDTH, _SCALE, _BATCH, _FRAMES = len(MIRROR), 256, 5.0, 32, 60
 
 
 class MotionModel(nn.Module):
-    """Poses (N, T, 22, 3), metres, and what each joint moved to them, to those of the next frames; and the state."""
+    """Predicts the next poses from poses (N, T, 22, 3), metres, and each joint's last displacement; also returns the
+    state."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -56,7 +58,7 @@ class MotionModel(nn.Module):
 def train(
     motion: MotionClips, steps: int, seed: int, track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x
 ) -> MotionModel:
-    """Train to predict the next pose, by the mean square."""
+    """Train to predict the next pose, with a mean square loss."""
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 2))
     net = MotionModel()
@@ -78,14 +80,14 @@ def train(
 
 
 class Bones:
-    """Lengths of the limbs of C bodies, as far as they are known."""
+    """Limb lengths of C bodies, as far as they are known."""
 
     def __init__(self, clips: int) -> None:
         self._moments = np.zeros((3, clips, len(_LIMBS)))  # frames, sum and sum of squares of lengths
         self._known = np.zeros((clips, len(_LIMBS)), dtype=bool)
 
     def take(self, poses: Floats) -> None:
-        """Measure poses (C, 22, 3), metres; a missing joint's bone is not measured."""
+        """Measure poses (C, 22, 3), metres; bones of missing joints are not measured."""
         length = np.linalg.norm(poses[:, _LIMBS] - poses[:, _PARENTS], axis=-1)
         self._moments += np.nan_to_num(np.stack([length / length, length, length**2]))
         frames, mean = self._moments[0], self._mean
@@ -97,7 +99,7 @@ class Bones:
         return self._moments[1] / np.maximum(self._moments[0], 1.0)
 
     def put_right(self, poses: Floats) -> Floats:
-        """Poses (C, 22, 3) whose limbs have their mean lengths where these are known."""
+        """Return poses (C, 22, 3) whose limbs have their mean lengths where these are known."""
         poses = poses.copy()
         for bone, (joint, parent) in enumerate(zip(_LIMBS, _PARENTS, strict=True)):
             offset, mean = poses[:, joint] - poses[:, parent], self._mean[:, bone]
@@ -111,16 +113,16 @@ class Bones:
 def filtered(
     net: nn.Module, seen: Floats, stamps_s: Floats, delay: int, alpha: float, theta: float, kept: float
 ) -> Floats:
-    """Poses (T, C, 22, 3), metres; NaN before a joint is first measured.
+    """Filter clips; returns poses (T, C, 22, 3), metres, NaN before a joint's first measurement.
 
     Args:
-        net: a `MotionModel`, whose frames are those of 30 Hz.
+        net: a `MotionModel`, at 30 Hz.
         seen: (T, C, 22, 3) metres, NaN where missing.
         stamps_s: (T,) seconds.
-        delay: frames; the filter has none, and answers of them.
-        alpha: how soon speed takes trust from a measurement, s²/m².
-        theta: trust from which on a measurement is taken as it is.
-        kept: weight of a frame against the output before it.
+        delay: frames; not used.
+        alpha: how fast trust in a measurement falls with speed, s²/m².
+        theta: trust above which a measurement is taken as it is.
+        kept: weight of the current frame against the last output.
     """
     output, pose, covariance = seen.copy(), seen[0].copy(), np.ones(seen.shape[1:3])
     moved, returns = np.zeros_like(pose), np.zeros(covariance.shape, dtype=bool)

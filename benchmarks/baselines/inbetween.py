@@ -1,4 +1,4 @@
-"""Baselines of completion: fill gaps, or hidden parts of a body, without a network.
+"""Baselines of completion: they fill gaps, or hidden parts of a body, without a network.
 
 Each returns local rotations and the root of whole windows, as `prior.complete.body.Fill`.
 """
@@ -17,24 +17,24 @@ from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.training.data.dataset import MotionSet
 
 InBetween = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
-"""Clips (C, T, 22, 3) metres, NaN in the gap; their rotations (C, T, 22, 3, 3) and bones (C, 22, 3); to the rotations
-and the roots (C, T, 3) with the gap filled."""
+"""Maps clips (C, T, 22, 3) metres, NaN in the gap, with rotations (C, T, 22, 3, 3) and bones (C, 22, 3), to the filled
+rotations and roots (C, T, 3)."""
 
 
 def zero_velocity(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-    """The last pose before the gap, held."""
+    """Hold the last pose before the gap."""
     rows = held_rows(positions)
     return rotations[:, rows], positions[:, rows, 0]
 
 
 def held_rows(positions: Floats) -> NDArray[np.intp]:
-    """(T,) index of the last known frame at each frame, for clips with the same gap."""
+    """Return the index of the last known frame at each frame, (T,), for clips with the same gap."""
     known = np.isfinite(positions[0, :, 0, 0])
     return np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
 
 
 def slerp_and_lerp(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-    """Rotations along the shortest arc, the root along a line."""
+    """Interpolate rotations along the shortest arc, and the root along a line."""
     rows = np.flatnonzero(np.isfinite(positions[0, :, 0, 0]))
     times = np.arange(positions.shape[1])
     turned = np.empty_like(rotations)
@@ -48,11 +48,11 @@ def slerp_and_lerp(positions: Floats, rotations: Floats, offsets: Floats) -> tup
 
 
 def cubic_spline(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-    """A natural cubic spline through all that is known: of the root, and of the quaternions, then made unit."""
+    """Fit a natural cubic spline through all known roots and quaternions, and normalise the quaternions."""
     rows = np.flatnonzero(np.isfinite(positions[0, :, 0, 0]))
     times = np.arange(positions.shape[1])
     q = Rotation.from_matrix(rotations[:, rows].reshape(-1, 3, 3)).as_quat().reshape(len(positions), len(rows), 22, 4)
-    for t in range(1, len(rows)):  # on the side of the one before
+    for t in range(1, len(rows)):  # keep the sign of the quaternion before
         q[:, t] *= np.where((q[:, t] * q[:, t - 1]).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
     between = CubicSpline(rows, q, axis=1, bc_type="natural")(times)
     turned = Rotation.from_quat(between.reshape(-1, 4)).as_matrix().reshape(*between.shape[:3], 3, 3)
@@ -62,7 +62,7 @@ def cubic_spline(positions: Floats, rotations: Floats, offsets: Floats) -> tuple
 class NearestWindow:
     """The training window nearest in the known joints, fitted between the known ends.
 
-    Its deviation from slerp and lerp between its own ends is added to slerp and lerp between these.
+    Its deviation from slerp and lerp between its own ends is added to slerp and lerp between the known ends.
     """
 
     def __init__(self, motion: MotionSet, step: int = 5) -> None:
@@ -95,12 +95,12 @@ class NearestWindow:
 
 
 def _seen_from(joints: Floats, yaw: Floats) -> Floats:
-    """(N, K, 22, 3) joints, turned so that the body faces +x, the last but one's root at the origin."""
+    """Return joints (N, K, 22, 3) rotated so that the body faces +x, with the last but one's root at the origin."""
     return (joints - joints[:, -2, None, :1]) @ yaw_matrix(yaw)[:, None]
 
 
 def nearest_rows(query: NDArray[np.floating], bank: NDArray[np.floating], at_once: int = 64) -> NDArray[np.intp]:
-    """(Q,) which of ``bank`` (N, D) is nearest to each of ``query`` (Q, D)."""
+    """Return the row of ``bank`` (N, D) nearest to each ``query`` (Q, D), (Q,)."""
     bank32 = bank.astype(np.float32)
     norms = (bank32 * bank32).sum(axis=1)
     found = [
@@ -111,7 +111,7 @@ def nearest_rows(query: NDArray[np.floating], bank: NDArray[np.floating], at_onc
 
 
 class NearestPose:
-    """Of a body of which parts are hidden all the time: what training people had there in the nearest window."""
+    """Fills always hidden parts of a body from the training window nearest in the other joints."""
 
     EVERY = 5
 
@@ -123,12 +123,12 @@ class NearestPose:
         self._bank = _about_root(motion.positions[rows].numpy(), facing).astype(np.float32)
 
     def __call__(self, positions: Floats, truth_yaw: Floats, hidden: Sequence[int]) -> Floats:
-        """Clips (C, T, 22, 3) with the joints ``hidden`` filled in, about the root that is known.
+        """Fill the joints ``hidden`` of clips (C, T, 22, 3), about the known root.
 
         Args:
             positions: metres, NaN where hidden.
-            truth_yaw: (C,) radians, heading in the first frame.
-            hidden: joints.
+            truth_yaw: (C,) heading in the first frame, radians.
+            hidden: indices of the hidden joints.
         """
         seen = np.setdiff1d(np.arange(22), hidden)
         query = _about_root(positions[:, :: self.EVERY], truth_yaw)[:, :, seen]

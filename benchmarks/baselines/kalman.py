@@ -1,8 +1,8 @@
 """Kalman filters of a constant derivative with fixed-lag smoothing, over many joints at once.
 
-Written for comparison, as the textbook has it (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The smoother
-is the filter of a state that the last positions are part of (Anderson and Moore 1979, section 7.3), which is what
-Rauch, Tung and Striebel's backward sweep over these frames gives.
+A textbook implementation for comparison (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The smoother is
+the filter of a state that includes the last positions (Anderson and Moore 1979, section 7.3), which equals Rauch, Tung
+and Striebel's backward sweep over these frames.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 
 _UNKNOWN = (1e3, 1.0, 5.0)
-"""Standard deviations of a joint never seen: metres, m/s, m/s²."""
+"""Standard deviations of a joint never observed: metres, m/s, m/s²."""
 
 
 class Smoothed(NamedTuple):
-    """What a smoother says of (T, N) joints."""
+    """Output of a smoother for (T, N) joints."""
 
-    positions: Floats  # (T, N, 3) metres, each frame's given the measurements up to ``delay`` frames later
-    log_likelihood: Floats  # (T, N) of each measurement, given those before; 0 where there is none, or none before
+    positions: Floats  # (T, N, 3) metres, given the measurements up to ``delay`` frames later
+    log_likelihood: Floats  # (T, N) of each measurement, given the earlier ones; 0 without them
 
 
 def transition(order: int, step: float) -> Floats:
-    """(n, n) state transition over ``step`` seconds: Taylor's series."""
+    """Return the state transition (n, n) over ``step`` seconds: Taylor's series."""
     return np.array(
         [[step ** (j - i) / factorial(j - i) if j >= i else 0.0 for j in range(order)] for i in range(order)]
     )
 
 
 def process_noise(order: int, step: float) -> Floats:
-    """(n, n) covariance that white noise of unit density on the last derivative adds in ``step`` seconds."""
+    """Return the covariance (n, n) that white noise of unit density on the last derivative adds in ``step`` seconds."""
     ahead = [order - 1 - i for i in range(order)]
     return np.array([[step ** (a + b + 1) / (factorial(a) * factorial(b) * (a + b + 1)) for b in ahead] for a in ahead])
 
@@ -42,25 +42,25 @@ def process_noise(order: int, step: float) -> Floats:
 def fixed_lag(
     seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, measurement_sigma: float = 0.02
 ) -> Floats:
-    """Each frame's estimate, given the measurements up to ``delay`` frames later (those there are, at the end).
+    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
 
     Args:
         seen: (T, ..., 3) metres, NaN where missing.
         stamps_s: (T,) seconds.
         delay: frames.
         order: 2 for constant velocity, 3 for constant acceleration.
-        density: power spectral density of the noise on the derivative after that: m²/s³ for 2, m²/s⁵ for 3.
+        density: power spectral density of the noise on the next derivative: m²/s³ for 2, m²/s⁵ for 3.
         measurement_sigma: metres.
 
     Returns:
-        (T, ..., 3); NaN where a joint had not been seen by then.
+        (T, ..., 3); NaN where a joint had not been observed yet.
     """
     sigma = np.full(seen.shape[:-1], measurement_sigma)
     return smooth(seen, stamps_s, delay, order, density, sigma).positions.reshape(seen.shape)
 
 
 def smooth(seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, sigma: Floats) -> Smoothed:
-    """The same with a measurement noise of its own for each observation, ``sigma`` (T, ...) metres; joints in a row."""
+    """Run the smoother with a measurement noise for each observation, ``sigma`` (T, ...) metres; joints in a row."""
     frames = len(seen)
     z = np.ascontiguousarray(seen.reshape(frames, -1, 3))
     steps = np.diff(stamps_s)
@@ -77,7 +77,7 @@ def _smooth(z, variance, forward, added, unknown, delay, answers, likelihood):  
     frames, joints, _ = z.shape
     n, lags = len(unknown), delay + 1
     place = np.empty((lags, 3))  # of the last frames, by frame number modulo lags
-    cross = np.empty((lags, n))  # their covariance with the newest state
+    cross = np.empty((lags, n))  # covariance of these with the newest state
     state, covariance, ahead = np.empty((n, 3)), np.empty((n, n)), np.empty((n, n))
     column = np.empty(n)
     for j in range(joints):

@@ -1,8 +1,8 @@
 """Baselines that learn a Kinect's error from recordings with a reference, trained in seconds.
 
-Both read poses in the frame of the trunk, smoothed by a constant-velocity Kalman filter, and predict a correction of
-the 13 scored joints of that smoother: a ridge regression on one frame (66 inputs), and a temporal convolution over 24
-frames, up to 4 of them ahead, with 64 channels.
+Both read poses in the trunk's frame, smoothed by a constant-velocity Kalman filter, and predict a correction of the
+smoother's 13 scored joints. One is a ridge regression on one frame (66 inputs). The other is a temporal convolution
+over 24 frames, up to 4 of them ahead, with 64 channels.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ _CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A clip, smoothed.
+    """A smoothed clip.
 
     Attributes:
-        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part
-            of the delay that the regression does not look ahead itself.
+        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part of the
+            delay that the regression does not look ahead itself.
         answer: (T, 13, 3) metres, the scored joints, smoothed with the whole delay.
         trunk: (T, 3, 3) the trunk's frame in that of the answer.
     """
@@ -51,18 +51,19 @@ class Smoothed:
     trunk: Floats
 
     def corrected(self, missing: Floats) -> Floats:
-        """(T, 13, 3) the answer with (T, 39) in the trunk's frame added."""
+        """Add a correction (T, 39) in the trunk's frame to the smoothed joints, (T, 13, 3)."""
         return self.answer + np.einsum("tab,tjb->tja", self.trunk, missing.reshape(len(missing), -1, 3))
 
     def missing(self, truth: Floats) -> Floats:
-        """(T, 39) what the answer lacks to the truth, which is first aligned to it as a whole."""
+        """Return the correction (T, 39) from the smoothed joints to the truth, which is first aligned to them as a
+        whole."""
         rotation, translation = rigid_alignment(truth, self.answer)
         gap = truth @ rotation.T + translation - self.answer
         return np.einsum("tba,tjb->tja", self.trunk, gap).reshape(len(gap), -1)
 
 
 def smoothed(clips: Sequence[Floats], scored: Sequence[int], delay: int, ahead: int, density: float) -> list[Smoothed]:
-    """Clips (T, 22, 3) of a Kinect's own joints, ready for a regression of this delay that itself looks ``ahead``."""
+    """Smooth clips (T, 22, 3) of a Kinect's own joints for a regression of this delay that itself looks ``ahead``."""
     longest = max(map(len, clips))
     seen = np.full((longest, len(clips), *clips[0].shape[1:]), np.nan)
     for number, clip in enumerate(clips):
@@ -88,7 +89,7 @@ def _in_trunk(kinect: Floats) -> Floats:
 
 
 def ridge(train: Sequence[Smoothed], truths: Sequence[Floats], penalty: float) -> Callable[[Smoothed], Floats]:
-    """Fit on clips with their truths (T, 13, 3); gives a function from a clip to its answer."""
+    """Fit on clips with their truths (T, 13, 3); returns a function from a clip to its estimate."""
     x = np.concatenate([clip.inputs for clip in train])
     y = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
     known = np.isfinite(y).all(axis=1)
@@ -97,7 +98,7 @@ def ridge(train: Sequence[Smoothed], truths: Sequence[Floats], penalty: float) -
 
 
 class TemporalConvolution(nn.Module):
-    """(B, 24, 66) standardised poses to (B, 39), what is missing at one of them, standardised."""
+    """Maps standardised poses (B, 24, 66) to the standardised correction (B, 39) of one of them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,17 +120,17 @@ def temporal_convolution(
     steps: int,
     seed: int,
 ) -> Callable[[Smoothed], Floats]:
-    """The same by a network.
+    """Fit a temporal convolution, as `ridge` fits a regression.
 
-    Six people are few: half of each batch is mirrored, and a window's joints all lie a little elsewhere.
+    Six people are few, so half of each batch is mirrored, and all joints of a window are shifted a little.
 
     Args:
         train: clips.
-        truths: of them, (T, 13, 3).
-        mirror: for each of the 13 joints, which of them is the other side's.
-        ahead: frames of the window that are later than the one that is answered.
-        steps: of training.
-        seed: of weights and sampling.
+        truths: their truths, (T, 13, 3).
+        mirror: index of the other side's joint, for each of the 13 joints.
+        ahead: number of frames in the window after the estimated one.
+        steps: number of training steps.
+        seed: seed of weights and sampling.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -137,7 +138,7 @@ def temporal_convolution(
     gaps = np.concatenate([clip.missing(truth) for clip, truth in zip(train, truths, strict=True)])
     known = np.flatnonzero(np.isfinite(gaps).all(axis=1))
     targets = torch.from_numpy(gaps).float()
-    # Both sides count, for standardised poses to be mirrored as poses are.
+    # Both sides count, so that standardised poses can be mirrored like poses.
     poses, errors = windows[known, -1 - ahead], targets[known]
     poses, errors = torch.cat([poses, _mirrored(poses, _OTHER_SIDE)]), torch.cat([errors, _mirrored(errors, mirror)])
     mean, scale = poses.mean(dim=0), poses.std(dim=0).clamp(min=_MIN_SCALE)
@@ -168,18 +169,18 @@ def temporal_convolution(
 
 
 def look_ahead(delay: int) -> int:
-    """Frames that the convolution looks ahead at a delay; the smoother before it has the rest."""
+    """Return the number of frames that the convolution looks ahead at a delay; the smoother before it uses the rest."""
     return min(delay, _MAX_AHEAD)
 
 
 def _windows(clip: Smoothed, ahead: int) -> Tensor:
-    """(T, 24, 66), the clip's ends repeated; views of one padded copy."""
+    """Return windows (T, 24, 66), with the clip's ends repeated; views of one padded copy."""
     x = torch.from_numpy(clip.inputs).float()
     before = x[:1].expand(_FRAMES - 1 - ahead, -1)
     return torch.cat([before, x, x[-1:].expand(ahead, -1)]).unfold(0, _FRAMES, 1).transpose(1, 2)
 
 
 def _mirrored(vectors: Tensor, other_side: Sequence[int]) -> Tensor:
-    """Vectors (..., 3 J) in the trunk's frame as a mirror across its xz plane shows them."""
+    """Mirror vectors (..., 3 J) in the trunk's frame across its xz plane."""
     joints = vectors.unflatten(-1, (-1, 3))[..., list(other_side), :]
     return (joints * joints.new_tensor([1.0, -1.0, 1.0])).flatten(-2)

@@ -1,8 +1,9 @@
-"""A whole-body denoiser as a baseline: a recurrent network over all joints at once, causal, trained like the others.
+"""A whole-body denoiser as a baseline: a causal recurrent network over all joints at once.
 
-A GRU of 256 units sees the joints about the last pelvis, in the frame of the last hips, those missing held; which are
-missing; and what each moved since the frame before. It gives what to add to the held joint of each frame that a delay
-asks for. Corrupted motion is that of the SmoothNet-style baseline, turned about the vertical at random, and mirrored.
+A GRU of 256 units receives the joints about the last pelvis, in the frame of the last hips, with missing joints held;
+which joints are missing; and each joint's displacement since the frame before. It predicts a correction of the held
+joints of each frame that a delay needs. It is trained on the corrupted motion of the SmoothNet-style baseline, rotated
+about the vertical at random, and mirrored.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
 
 _WIDTH = 256
-_SCALE = 5.0  # a metre in the network's unit
+_SCALE = 5.0  # units per metre in the network
 STEPS = 6000
-"""Number of optimiser steps. With the batch, in clips, and a clip's frames: as many as the product's mixture had."""
+"""Number of optimiser steps. With the batch, in clips, and a clip's length, in frames, as many as the product's mixture
+had."""
 _BATCH, _FRAMES = 32, 90
 _JOINTS = len(MIRROR)
 
 
 class RecurrentDenoiser(nn.Module):
-    """(N, T, 22, 3) held joints and (N, T, 22) which are missing, to (N, T, D, 22, 3) of D delays."""
+    """Maps held joints (N, T, 22, 3) and their missing mask (N, T, 22) to joints (N, T, D, 22, 3) at D delays."""
 
     def __init__(self, delays: Sequence[int]) -> None:
         super().__init__()
@@ -42,13 +44,13 @@ class RecurrentDenoiser(nn.Module):
         origin, turn = held[:, :, J["pelvis"], None], _headings(held)
         x = torch.cat([_SCALE * (held - origin) @ turn, 10 * _SCALE * moved @ turn, gone[..., None]], dim=-1)
         x = x.flatten(2)
-        # the noise of a frame long seen is not for the state to remember
+        # keep the noise of earlier frames out of the state
         known = torch.cat([self.gru(x)[0], self.at_delay(x).flatten(2)], dim=-1)
         added = self.decode(known).unflatten(-1, (len(self.delays), _JOINTS, 3)) / _SCALE
         return self.at_delay(held) + added @ turn[:, :, None].transpose(-1, -2)
 
     def at_delay(self, values: Tensor) -> Tensor:
-        """(N, T, D, ...) of (N, T, ...): as they were so many frames before, or at the start."""
+        """Return values (N, T, ...) of as many frames before as each delay, or of the start: (N, T, D, ...)."""
         frames = torch.arange(values.shape[1])[:, None] - torch.tensor(self.delays)
         return values[:, frames.clamp(min=0)]
 
@@ -84,8 +86,10 @@ def train(
 
 @torch.inference_mode()
 def smooth(net: RecurrentDenoiser, seen: Floats) -> list[Floats]:
-    """Answers (T, C, 22, 3) of clips (T, C, 22, 3) at each of the network's delays; the last frames of a clip are those
-    of the least delay that has them."""
+    """Denoise clips (T, C, 22, 3) at each of the network's delays.
+
+    The last frames of a clip are those of the shortest delay that has them.
+    """
     found = net(*_inputs(seen)).numpy().swapaxes(0, 1).astype(np.float64)
     answers = []
     for number, delay in enumerate(net.delays):
@@ -99,7 +103,7 @@ def smooth(net: RecurrentDenoiser, seen: Floats) -> list[Floats]:
 
 
 def _headings(held: Tensor) -> Tensor:
-    """(N, T, 3, 3) frames whose second axis is that from right to left hip, level, as columns."""
+    """Return frames (N, T, 3, 3), as columns, whose second axis is the level direction from right to left hip."""
     left = held[:, :, J["left_hip"]] - held[:, :, J["right_hip"]]
     left = nn.functional.normalize(left * torch.tensor([1.0, 1.0, 0.0]), dim=-1, eps=1e-3)
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(left)
@@ -107,7 +111,7 @@ def _headings(held: Tensor) -> Tensor:
 
 
 def _turned(truth: Floats, rng: np.random.Generator) -> Floats:
-    """(T, B, 22, 3): each clip turned about the vertical, half of them mirrored."""
+    """Rotate each clip (T, B, 22, 3) about the vertical, and mirror half of them."""
     angle = rng.uniform(0, 2 * np.pi, truth.shape[1])
     turn = np.zeros((truth.shape[1], 3, 3))
     turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)

@@ -1,9 +1,9 @@
-"""A SmoothNet-style baseline: a small network along time alone, the same for every coordinate of every joint.
+"""A SmoothNet-style baseline: a small network along time only, the same for every coordinate of every joint.
 
 After Zeng et al., "SmoothNet: A Plug-and-Play Network for Refining Human Poses in Videos", ECCV 2022: fully connected
-residual blocks over a window of 32 frames, losses on positions and accelerations. Here it also sees which frames a
-joint was missing in, and is trained on this project's motion, corrupted as the protocols do. One training serves every
-delay: of the 32 frames that a window gives, a delay of k keeps the one k before the newest.
+residual blocks over a window of 32 frames, with losses on positions and accelerations. Here it also receives in which
+frames a joint was missing, and is trained on this project's motion, corrupted as in the studies. One training serves
+every delay: for a delay of k, the output is the frame k before the newest of the window.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 
 WINDOW = 32
-"""Frames."""
+"""Length of a window, frames."""
 _WIDTH, _BLOCKS = 128, 3
-_SCALE = 10.0  # a metre in the network's unit
+_SCALE = 10.0  # units per metre in the network
 _BATCH = 16  # windows of whole bodies
 
 
 class SmoothNet(nn.Module):
-    """(N, 32) positions along an axis, missing ones held, and (N, 32) which are missing, to (N, 32) positions."""
+    """Maps positions along an axis (N, 32), missing ones held, and their missing mask (N, 32) to positions (N, 32)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,9 +73,9 @@ def train(
 
 @torch.inference_mode()
 def smooth(net: SmoothNet, seen: Floats, delays: Sequence[int]) -> list[Floats]:
-    """Answers (T, ..., 3) of clips (T, ..., 3) at each delay, all of them from the same windows."""
+    """Smooth clips (T, ..., 3) at each delay, all from the same windows."""
     last = len(seen) - 1
-    lead = np.broadcast_to(seen[:1], (WINDOW - 1, *seen.shape[1:]))  # a clip younger than the window repeats its start
+    lead = np.broadcast_to(seen[:1], (WINDOW - 1, *seen.shape[1:]))  # a clip shorter than the window repeats its start
     held, gone = _inputs(np.concatenate([lead, seen]))
     answers = [np.empty(seen.shape) for _ in delays]
     for newest in range(len(seen)):
@@ -88,15 +88,18 @@ def smooth(net: SmoothNet, seen: Floats, delays: Sequence[int]) -> list[Floats]:
 
 
 def _inputs(seen: Floats) -> tuple[Tensor, Tensor]:
-    """(..., 3, T) positions held, and which are missing, of (T, ..., 3)."""
+    """Return held positions and the missing mask, (..., 3, T), of (T, ..., 3)."""
     held = hold_last(seen, np.arange(len(seen), dtype=np.float64), 0)
     gone = np.repeat(missing(seen)[..., None], 3, axis=-1)
     return tuple(torch.from_numpy(np.moveaxis(x, 0, -1)).float().contiguous() for x in (held, gone))  # type: ignore[return-value]
 
 
 def corrupt(truth: Floats, rng: np.random.Generator) -> Floats:
-    """Each window with a noise of its own, (T, B, 22, 3): 0.5 to 8 cm, independent or correlated; spikes in a third
-    of them; in half, a limb away, but never from the start."""
+    """Corrupt each window (T, B, 22, 3) with its own noise.
+
+    The noise is 0.5 to 8 cm, independent or correlated. A third has spikes. In half a limb is missing, but never from
+    the start.
+    """
     size = np.exp(rng.uniform(np.log(0.005), np.log(0.08), truth.shape[1]))[:, None, None]
     zero = np.zeros_like(truth)
     kind = rng.random(truth.shape[1]) < 0.5

@@ -1,8 +1,8 @@
-"""A baseline for hidden joints: one Kalman filter of the whole body, in which they accelerate as the others do.
+"""A baseline for hidden joints: one Kalman filter of the whole body, with correlated joint accelerations.
 
 The state is the position and velocity of 22 joints. Velocities are damped, and joints accelerate with the covariance of
-training motion (`prior.models.mixture.tracks`), the only thing learned; it is the same for x, y and z, so that one
-covariance (44, 44) serves all three axes. A hidden joint contributes no measurement: it follows from the others'.
+training motion (`prior.models.mixture.tracks`), the only thing learned. It is the same for x, y and z, so one
+covariance (44, 44) serves all three axes. A hidden joint contributes no measurement; it follows from the others'.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
 MIN_SIGMA = 0.01
-"""Standard deviation of a measurement along an axis, at least; metres. Modes are not exact: taken at less, a joint's
-noise moves those that are hidden."""
+"""Lower bound of a measurement's standard deviation along an axis, metres. Modes are not exact: with less, a joint's
+noise moves hidden joints."""
 
 FIRST_PLACE, FIRST_SPEED = 1.0, 1.0
-"""Standard deviations of a joint not yet measured: its position in metres, its velocity in m/s."""
+"""Standard deviations of a joint before its first measurement: position in metres, velocity in m/s."""
 
 
 class WholeBody(NamedTuple):
     """State of S bodies.
 
     Attributes:
-        mean: (S, 44, 3) positions in metres, then velocities in m/s; the positions are NaN before a first measurement.
+        mean: (S, 44, 3) positions in metres, then velocities in m/s; positions are NaN before a first measurement.
         covariance: (S, 44, 44) the same for each axis.
     """
 
@@ -39,14 +39,14 @@ class WholeBody(NamedTuple):
 
 
 def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float, damping: float) -> Floats:
-    """The input; a hidden joint where the filter has it, given the measurements up to its own frame.
+    """Return the input, with hidden joints estimated by the filter from the measurements up to their own frame.
 
     Args:
         seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
         stamps_s: (T,) seconds.
         delay: frames; not used.
-        density: process density, m²/s³, the mean of the joints'.
-        damping: of velocities, 1/s.
+        density: mean process density of the joints, m²/s³.
+        damping: damping of velocities, 1/s.
     """
     answers, clips, sigma = beside(seen, stamps_s, delay), seen.shape[1], np.full(22, MIN_SIGMA)
     first = np.diag(np.repeat(np.square([FIRST_PLACE, FIRST_SPEED]), 22))
@@ -63,17 +63,17 @@ def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float
 
 @njit(cache=True)
 def _step(state, slot, measured, sigma, modes, dt, density, damping):
-    """One step of a body: predict, and update by the joints that are measured, one after the other.
+    """Predict a body's state, and update it by each measured joint in turn.
 
     Args:
         state: a `WholeBody`.
-        slot: of the body.
-        measured: (22, 3) metres, NaN of joints that are not.
+        slot: index of the body.
+        measured: (22, 3) metres, NaN for joints without a measurement.
         sigma: (22,) metres along an axis.
-        modes: (22, 22) covariance of joints' accelerations, of mean variance 1.
+        modes: (22, 22) covariance of joint accelerations, of mean variance 1.
         dt: seconds since the last step.
         density: process density, m²/s³.
-        damping: of velocities, 1/s.
+        damping: damping of velocities, 1/s.
     """
     mean, covariance, joints = state.mean[slot], state.covariance[slot], 22
     kept = math.exp(-damping * dt)
@@ -108,7 +108,7 @@ def _step(state, slot, measured, sigma, modes, dt, density, damping):
 def _measure(mean, covariance, joint, measured, sigma):
     """Update by one joint (3,)."""
     if math.isnan(mean[joint, 0]):
-        # the first measurement: it says nothing of other joints, nor do these of it
+        # the first measurement is independent of all other joints
         for k in range(len(mean)):
             covariance[joint, k] = covariance[k, joint] = 0.0
         covariance[joint, joint] = sigma * sigma
