@@ -189,7 +189,7 @@ def _last_seen(seen: Floats) -> NDArray[np.intp]:
 
 
 def _overlap(frames: int, shift: int) -> tuple[slice, slice]:
-    """Return the slices of frames t + shift and of frames t for which both exist."""
+    """Return the slices of frames t and of frames t + shift for which both exist."""
     start, end = max(0, -shift), max(0, min(frames, frames - shift))
     return slice(start, end), slice(start + shift, max(0, end + shift))
 

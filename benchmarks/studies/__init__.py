@@ -1,4 +1,4 @@
-"""The studies of ``steadypose evaluate``, one module each, by name: ``run``, from a `Bench` to a `Result`, and
+"""The studies of ``steadypose evaluate``, one module each. Each has ``run``, from a `Bench` to a `Result`, and
 ``DEPENDS_ON`` (`results.Study`)."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STUDIES: dict[str, str] = {
     "event_mocap": "events of motion capture whose names say what it holds",
     "ablations": "what each part of the default is worth, and its milliseconds",
 }
-"""Module in this package: what it measures."""
+"""Description of what each module of this package measures."""
 
 SENSORS = {
     "kinect_vicon": "ui_prmd.npz",
@@ -27,7 +27,7 @@ SENSORS = {
     "mediapipe": "mediapipe_pose.npz",
     "contacts": "contacts_grf.npz",
 }
-"""Studies with recordings of their own, and the file of them."""
+"""Studies with their own recordings, and the file of each."""
 
 PREPARED = ("event_mocap",)
-"""Studies in which no simulated people stand in for prepared motion."""
+"""Studies that need prepared motion and cannot use simulated people instead."""

@@ -1,9 +1,10 @@
-"""Ablations: what each part of the default is worth, and what it costs, each switched off by itself.
+"""Ablations: accuracy and cost of each part of the default, each switched off separately.
 
-A part that has a setting is switched off by it; the whole-body experts and the share that white noise leaves to the
-multiple-model estimate have none, and are replaced in place. The world's parts are ablated behind the default prior, in
-noise of 2 cm that lasts, with the floor known. Errors are means over people, in units of what ships, paired by clip
-(`benchmarks.intervals`). Cost: of one body of which an arm is hidden, a frame at a time, so that every part has work.
+A part with a setting is switched off by it. The whole-body experts and the multiple-model estimate's weight in white
+noise have none and are replaced in place. The trajectory's parts are ablated after the default prior, in
+time-correlated noise of 2 cm, with a known floor. Errors are means over people, relative to what ships, paired by clip
+(`benchmarks.intervals`). Cost is measured on one body with a hidden arm, a frame at a time, so that every part has
+work.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ AS_IT_SHIPS = "as it ships"
 DELAY = 4
 CLIPS, FRAMES = 48, 90
 ROUNDS = 6
-"""Times that every variant is timed, in turn; of each frame the least counts, as other work only adds to it."""
+"""Number of times that every variant is timed, in turn. The least time of each frame counts, because other work only
+adds to it."""
 
 
 class Part(NamedTuple):
@@ -79,8 +81,8 @@ PARTS: Mapping[str, Part] = {
     "without orientations by the whole body": Part(PriorSettings(orient=OrientSettings(enabled=False))),
     "with HM-VAE, which is off": Part(PriorSettings(refine=RefineSettings(enabled=True))),
 }
-"""Each part by what is measured without it. Whole-body experts: joints are smoothed each by itself, by the same
-network."""
+"""Settings by what is measured without each part. Without whole-body experts, joints are smoothed separately, by the
+same network."""
 
 PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
     AS_IT_SHIPS: TrajectorySettings(),
@@ -96,11 +98,11 @@ CONDITIONS: Mapping[str, Condition] = {
     },
     **{name: hidden_joints.CONDITIONS[name] for name in ("0.5 s", "legs never")},
 }
-"""Where joints are hidden, their error is measured, else that of all joints."""
+"""Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
 
 
 def run(bench: Bench) -> Result:
-    """Every part off, in every condition; then the world's."""
+    """Measure the prior without each part in every condition, then the trajectory."""
     clips = bench.clips(FRAMES, 4 if bench.quick else CLIPS)
     cost = costs(clips)
     records: list[dict[str, Any]] = []
@@ -124,7 +126,7 @@ def run(bench: Bench) -> Result:
 
 
 def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
-    """The same of `pose/world`, with the speed of feet that stand."""
+    """Measure `pose/world` without each part, including the speed of standing feet."""
     seen = correlated(clips.positions, 0.02, np.random.default_rng(0))
     records = []
     for name, settings in bench.progress.track(PARTS_OF_THE_WORLD.items(), description="world"):
@@ -138,7 +140,7 @@ def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
 
 
 def costs(clips: MotionClips) -> dict[str, float]:
-    """Milliseconds a frame of one body, of each of `PARTS`: the mean over a clip."""
+    """Return milliseconds per frame of one body for each of `PARTS`: the mean over a clip."""
     seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
 
     def frames(part: Part) -> Floats:
@@ -149,7 +151,7 @@ def costs(clips: MotionClips) -> dict[str, float]:
 
 
 def world_costs(clips: MotionClips) -> dict[str, float]:
-    """The same of `PARTS_OF_THE_WORLD`, without what the prior before it takes."""
+    """Return the same for `PARTS_OF_THE_WORLD`, without the time of the prior before it."""
     seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
     prior = PriorPipeline(PriorSettings(delay=DELAY))
     messages = list(product.stream(prior, seen, clips.stamps_s, calibrated=True))
@@ -162,19 +164,20 @@ def world_costs(clips: MotionClips) -> dict[str, float]:
 
 
 def _laps(answers: Iterable[object]) -> Floats:
-    """Milliseconds between one answer and the next."""
+    """Return the milliseconds between consecutive outputs."""
     ends = [time.perf_counter() for _ in answers]
     return 1e3 * np.diff(ends)
 
 
 def _least(variants: Mapping[str, Callable[[], Floats]]) -> dict[str, float]:
-    """The mean over frames of the least of `ROUNDS`, all variants in turn; a round before them compiles and loads."""
+    """Return the mean over frames of the least of `ROUNDS` times, all variants in turn, after a round that compiles and
+    loads."""
     rounds = [{name: run() for name, run in variants.items()} for _ in range(1 + ROUNDS)][1:]
     return {name: round(float(np.mean(np.min([laps[name] for laps in rounds], axis=0))), 3) for name in variants}
 
 
 def _record(condition: str, name: str, errors: Floats, acceleration: Floats) -> dict[str, Any]:
-    """Of each clip; metres in, mm out."""
+    """Return a record of the errors of each clip; metres in, mm out."""
     by_clip = {"mm": errors, "acceleration_mm": acceleration}
     return {
         "condition": condition, "method": name,
@@ -190,7 +193,8 @@ def _table(
     cost: Mapping[str, float],
     clips: MotionClips,
 ) -> Table:
-    """A row a part: in each condition the error in units of what ships, whose row has millimetres; milliseconds."""
+    """Build a table with a row for each part: errors in each condition relative to what ships, and milliseconds. The
+    row of what ships has millimetres."""
     conditions = list(dict.fromkeys(record["condition"] for record in records))
     by_key = {(record["method"], record["condition"]): record for record in records}
     rows = []

@@ -1,8 +1,8 @@
-"""Parts of the body that are hidden for a whole window, from the rest: legs, arms, all but a few joints.
+"""Completion of body parts that are hidden for a whole window: legs, arms, all but a few joints.
 
 Baselines are the mean pose, the conditional mean of one Gaussian over training poses (with the true heading of every
-frame), the nearest training window, and HG-VAE's completion, which the live node uses. Joints are compared about the
-root, which is known; windows are of 50 frames, as HG-VAE's.
+frame), the nearest training window, and HG-VAE's completion, which the live node uses. Joints are compared relative to
+the root, which is known. Windows have 50 frames, as HG-VAE's.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _NETWORK = "complete"
 
 
 def run(bench: Bench) -> Result:
-    """Every method over everything hidden."""
+    """Run every method for every hidden part."""
     clips = bench.clips(FRAMES, 64)
     train = prepared_set(bench.data, "train") if bench.data.is_file() else as_set(bench.training_clips())
     nearest = NearestPose(train, FRAMES)
@@ -113,7 +113,7 @@ def run(bench: Bench) -> Result:
 
 
 def mean_pose(completer: LiveCompleter) -> Fill:
-    """What is hidden in the mean pose, on the person's bones."""
+    """Fill hidden joints with the mean pose, on the person's bones."""
 
     def fill(positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
         window = read_window(positions, offsets, completer.usual)
@@ -126,7 +126,8 @@ def mean_pose(completer: LiveCompleter) -> Fill:
 
 @torch.inference_mode()
 def by_hgvae(model: HGVAE, given: Floats, offsets: Floats) -> Floats:
-    """Windows (C, T, 22, 3) metres, NaN where hidden, by HG-VAE's completion network; offsets (C, 22, 3) metres."""
+    """Complete windows (C, T, 22, 3) metres, NaN where hidden, by HG-VAE's completion network; offsets (C, 22, 3)
+    metres."""
     sizes = body_size(offsets)
     tracks = to_tracks(given, sizes)
     hung = standardise(model, tracks.x)

@@ -1,9 +1,9 @@
-"""Which feet bear load, against force plates: OpenCap's validation subjects, who walk, jump and squat.
+"""Contacts against force plates: OpenCap's validation subjects, who walk, jump and squat.
 
-Skin markers of ankle and toe, 100 frames a second, split into three streams of 30 Hz, serve as joints; no other
-joint is known to the network. A foot bears load where its plate measures more than 30 N. Noise is independent from
-frame to frame (HuMoR's 4 cm), and goes through the smoother that ships. Nothing was trained on these recordings; the
-rule that labels load, on which the network was trained with other people, has its 0.7 m/s from them.
+The joints are skin markers of ankle and toe, at 100 frames a second, split into three streams of 30 Hz; the network
+receives no other joints. A foot bears load where its plate measures more than 30 N. Noise is independent between frames
+(HuMoR's 4 cm) and passes through the smoother that ships. Nothing was trained on these recordings. But the rule that
+labels load, on which the network was trained with other people, takes its 0.7 m/s from them.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from steadypose.prior.timing.rate import FPS
 DEPENDS_ON = WORLD
 
 LOADED_N = 30.0
-"""Newtons from which on a foot bears load."""
+"""Force above which a foot bears load, newtons."""
 PHASES = 3
-"""Streams of 30 Hz that are read from one recording."""
+"""Number of 30 Hz streams from one recording."""
 NOISES = (0.0, 0.02, 0.04)
-"""Metres."""
+"""Standard deviations of the noise, metres."""
 DELAY = 4
 KINDS: Mapping[str, Callable[[str], bool]] = {
     "walking": lambda trial: trial.startswith("walking"),
@@ -49,8 +49,8 @@ class Trial(NamedTuple):
     """One stream of 30 Hz.
 
     Attributes:
-        kind: of `KINDS`.
-        joints: (T, 22, 3) metres, floor at 0; NaN but of ankles and toes.
+        kind: one of `KINDS`.
+        joints: (T, 22, 3) metres, floor at 0; NaN except for ankles and toes.
         loaded: (T, 2) whether the left and the right foot bear load.
         valid: (T, 2) where the plates measure.
     """
@@ -62,7 +62,7 @@ class Trial(NamedTuple):
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """All streams; heights of markers are counted from where each subject's are mostly lowest."""
+    """Read all streams. Heights of markers are relative to where each subject's markers usually are at their lowest."""
     trials = []
     with np.load(path) as data:
         names, fps = [str(name) for name in data["names"]], float(data["fps"])
@@ -94,7 +94,7 @@ def _at(places: Floats, times: Floats) -> Floats:
 
 
 def run(bench: Bench) -> Result:
-    """The rules and the network, under each noise."""
+    """Score the rules and the network under each noise."""
     assert bench.mocap is not None
     trials = read_trials(bench.mocap / "contacts_grf.npz")[:: 10 if bench.quick else 1]
     network = LiveContacts.load("default")
@@ -123,7 +123,7 @@ def run(bench: Bench) -> Result:
 
 
 def _smoothed(joints: Floats, noise: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Joints and their deviations as the smoother leaves them, of all frames but the last `DELAY`."""
+    """Return joints and their deviations after the smoother, for all frames except the last `DELAY`."""
     smoother = MixtureSmoother(DELAY, 1)
     seen = joints + noise * rng.standard_normal(joints.shape)
     answers = [smoother.update(frame[None], t / FPS) for t, frame in enumerate(seen)]
@@ -137,7 +137,7 @@ def _rule(seen: Floats, speed: float) -> Bools:
 
 
 def _asked(network: LiveContacts, seen: Floats, sigma: Floats) -> Bools:
-    """The network, frame by frame: a foot bears load where its ankle or its toe does."""
+    """Run the network frame by frame. A foot bears load where its ankle or its toe does."""
     ways = seen[:, [J["left_foot"], J["right_foot"]]] - seen[:, [J["left_ankle"], J["right_ankle"]]]
     way = np.nansum(ways, axis=1)
     yaw = np.arctan2(way[:, 1], way[:, 0])

@@ -1,4 +1,4 @@
-"""What the protocols on corrupted joints share: conditions over validation motion, every method in each of them."""
+"""Shared code of the studies of corrupted joints: run every method in each condition over validation motion."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from steadypose.benchmarks.scores import Scores, figures, pivot, score, source_t
 from steadypose.prior.arrays import Floats
 
 Condition = Callable[[Floats, np.random.Generator], Floats]
-"""Truth (T, C, 22, 3) to what is seen of it."""
+"""Maps true joints (T, C, 22, 3) to observed ones."""
 
 TUNED_ON = 3
-"""Baselines are tuned on every third of the very clips that are scored, with other noise: this favours them."""
+"""Step between the clips on which baselines are tuned. They are among the clips that are scored, with other noise,
+which favours the baselines."""
 
 HOW = (
     "Baselines are tuned on every third of these clips with other noise, each with the same number of evaluations, for "
@@ -34,13 +35,13 @@ HOW = (
 
 WHOLE_BODY = "whole-body bank"
 BY_SOURCE = ("bank of smoothers", WHOLE_BODY, RECURRENT, "conditional Gaussian", "steadypose")
-"""what stands in the tables by source, as far as a study has it"""
+"""Methods in the tables by source, as far as a study has them."""
 
 
 def by_source(
     records: Sequence[Mapping[str, Any]], error: str, delay: int, clips: MotionClips, name: str, title: str
 ) -> Table:
-    """Of `run_conditions`, a table by source of motion: ``error`` is ``position`` or ``hidden``."""
+    """Build a table by source of motion from `run_conditions`: ``error`` is ``position`` or ``hidden``."""
     found = {
         (r["condition"], r["method"]): 1e-3 * np.array(r["clips_mm"][error], dtype=float)
         for r in records
@@ -52,10 +53,10 @@ def by_source(
 def run_conditions(
     bench: Bench, clips: MotionClips, conditions: Mapping[str, Condition], baselines: Sequence[Baseline] = BASELINES
 ) -> dict[str, Any]:
-    """Every method in every condition: records, calibration, what was tried.
+    """Run every method in every condition; return records, calibration and the evaluated parameters.
 
-    The records carry ``condition``, ``method``, ``delay``, and `figures`; those of steadypose, where a baseline runs at
-    their delay, also the ratio of their errors to those of the best such baseline.
+    Records have ``condition``, ``method``, ``delay``, and `figures`. If a baseline runs at their delay, steadypose's
+    records also have the ratio of their errors to those of the best such baseline.
     """
     records: list[dict[str, Any]] = []
     calibration: list[dict[str, Any]] = []
@@ -115,9 +116,9 @@ def _record(
 def against_best(
     answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
 ) -> dict[str, Any]:
-    """Ratios of errors, with their 95 % intervals over people, to the best baseline that needs no longer delay.
+    """Return ratios of errors, with their 95 % intervals over people, to the best baseline that needs no longer delay.
 
-    Best is the one with the least of that very error, so that it may be another baseline for each.
+    The best baseline is the one with the least error of that kind, so it may differ between errors.
     """
     rivals = [(a, s) for a, s in scored if a.method not in PRODUCT and a.delay <= answer.delay and a.delay != OFFLINE]
     ratios: dict[str, Any] = {}
@@ -125,7 +126,7 @@ def against_best(
         mine = getattr(scores, name)
         usable = [(a, getattr(s, name)) for a, s in rivals]
         known = np.isfinite(mine)
-        # a baseline that leaves a joint without an answer is not the best at answering
+        # a baseline without an estimate for some joints does not count as the best
         usable = [(a, theirs) for a, theirs in usable if known.any() and np.isfinite(theirs[known]).all()]
         if usable:
             rival, theirs = min(usable, key=lambda pair: float(pair[1][known].mean()))
@@ -135,7 +136,7 @@ def against_best(
 
 
 def _calibration(error: Floats, sigma: Floats, hidden: NDArray[np.bool_]) -> dict[str, Any]:
-    """Error found by standard deviation stated, for seen and hidden joints, and the points of a reliability plot."""
+    """Return the error-to-sigma ratio of observed and hidden joints, and the points of a reliability plot."""
     return {
         group: {
             "ratio": round(sigma_ratio(error[mask], sigma[mask]), 3),
@@ -147,7 +148,7 @@ def _calibration(error: Floats, sigma: Floats, hidden: NDArray[np.bool_]) -> dic
 
 
 def reliability_bins(calibration: Sequence[Mapping[str, Any]], method: str, delay: int) -> dict[str, Any]:
-    """Of one method, the points of the reliability plot by condition and group."""
+    """Return one method's points of the reliability plot by condition and group."""
     return {
         f"{row['condition']}, {group}": row[group]["bins_m"]
         for row in calibration
@@ -158,7 +159,7 @@ def reliability_bins(calibration: Sequence[Mapping[str, Any]], method: str, dela
 
 
 def calibration_table(calibration: Sequence[Mapping[str, Any]], name: str) -> Table:
-    """Error found by standard deviation stated: of seen joints, and after a stroke of hidden ones, by condition."""
+    """Build a table of the error-to-sigma ratio by condition: observed joints, and after a slash hidden ones."""
     records = [
         {**row, "cell": " / ".join(f"{row[group]['ratio']:.2f}" for group in ("seen", "hidden") if group in row)}
         for row in calibration

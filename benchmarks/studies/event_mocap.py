@@ -1,9 +1,9 @@
-"""How well `prior.events` tells what people do in motion capture whose names say it.
+"""How well `prior.events` detects events in motion capture, with labels from the recordings' names.
 
-A camera with a Kinect's errors films prepared clips, and the nodes' own pipelines clean what it gives.
+A camera with a Kinect's errors observes prepared clips, and the nodes' own pipelines clean its output.
 
-A name says what a clip holds and so what it does not: who is named as walking waves at nobody. When something begins
-is of the true motion, by the measures of `event_scenes`. What neither name nor measure decides is left out.
+A name says what a clip contains and what it does not: a clip named as walking has no wave. Onsets come from the true
+motion, by the measures of `event_scenes`. Events that neither name nor measure decides are left out.
 """
 
 from __future__ import annotations
@@ -36,32 +36,33 @@ from steadypose.prior.timing.rate import FPS
 DEPENDS_ON = (*WORLD, "prior.events")
 
 SEED, ALL, CLIPS = 7, "all", 2
-"""Seed of places and noise; the group of all; clips of each action of a data set, at most."""
+"""Seed of positions and noise; name of the group of all; largest number of clips per action of a data set."""
 
 LONGEST, SHORTEST = round(15.0 * FPS), round(1.5 * FPS)
-"""frames: longer takes are cut, for people walk out of a camera's view"""
+"""Longest and shortest clips, frames. Longer takes are cut, because people walk out of the camera's view."""
 NEAREST, FARTHEST = 2.8, 4.0
-"""metres from the camera to the middle of a scene"""
+"""Distance from the camera to the middle of a scene, metres."""
 AT_END_S = 0.5
-"""What begins so shortly before the end of a clip need not be told."""
+"""Time before the end of a clip within which detecting a beginning is optional, seconds."""
 UP, FALL_S = 0.7, 2.0
-"""of the hips' greatest height, and seconds: who falls was up so shortly before lying"""
+"""Fraction of the hips' greatest height above which a person is up, and the time before lying within which a falling
+person was up, seconds."""
 ALWAYS_OPEN = {EventKind.ENTERED, EventKind.LEFT, EventKind.NEAR, EventKind.POINTS}
-"""kinds of which no name tells"""
+"""Kinds that no name decides."""
 ACTIONS = {
     "Bandai-Namco": (),
     "UI-PRMD (Vicon)": (),
     "LAFAN1": ("fallAndGetUp", "ground", "pushAndFall", "walk"),
 }
-"""that are taken of each data set; all, if none is named"""
+"""Actions taken from each data set; all if none is named."""
 OPEN = {"Bandai-Namco": {EventKind.SITS}, "LAFAN1": {EventKind.SITS, EventKind.WAVES}}
-"""kinds that a data set does not decide"""
+"""Kinds that a data set does not decide."""
 SQUATS = ("m01", "m02", "m03", "m04")
 WAVERS = ("wave", "bye")
 QUIET = ("walk", "run", "dash", "raise")
-"""of Bandai-Namco's actions those that wave, and those that surely do not"""
+"""Of Bandai-Namco's actions, those that wave and those that surely do not."""
 WAVE = 0.41
-"""radians out and back, that a wave is which these joints show"""
+"""Swing out and back of a forearm that counts as a wave in these joints, radians."""
 FALLERS = ("fallAndGetUp", "pushAndFall")
 
 
@@ -75,14 +76,15 @@ class Clip(NamedTuple):
 
 
 def mocap_clips(path: Path, measured: bool, most: int) -> list[Clip]:
-    """Clips of ``prepared.npz``: those that chose the thresholds, or the others, which measure them.
+    """Return clips of ``prepared.npz``: those on which the thresholds were chosen, or the others, which measure them.
 
-    Bandai-Namco's session and LAFAN1's actor that validate the networks, and UI-PRMD's s07, chose.
+    The thresholds were chosen on Bandai-Namco's session and LAFAN1's actor, which validate the networks, and on
+    UI-PRMD's s07.
 
     Args:
-        path: of the file.
-        measured: the people that measure.
-        most: clips of each action of a data set, as many of each person.
+        path: path of the file.
+        measured: whether to return the people who measure.
+        most: largest number of clips per action of a data set, equally many of each person.
     """
     with np.load(path) as data:
         source, action, subject, split = (data[key] for key in ("source", "action", "subject", "split"))
@@ -90,7 +92,7 @@ def mocap_clips(path: Path, measured: bool, most: int) -> list[Clip]:
     person = np.array([person_of(*told) for told in zip(source, subject, strict=True)])
     held = np.where(source == "UI-PRMD (Vicon)", subject == "s07", split == "val")
     wanted = np.isin(source, list(ACTIONS)) & (held != measured)
-    # UI-PRMD's others train the networks
+    # the other people of UI-PRMD train the networks
     wanted &= (source != "UI-PRMD (Vicon)") | (split == "val")
     what = np.array([told.partition(" ")[0] for told in action])
     clips = []
@@ -115,7 +117,7 @@ def mocap_clips(path: Path, measured: bool, most: int) -> list[Clip]:
 
 
 def scene_of(clip: Clip, rng: np.random.Generator) -> Scene:
-    """A clip before the camera: its middle faces it about, as far off as all of it is in view."""
+    """Place a clip before the camera: its middle roughly faces the camera, far enough that all of it is in view."""
     motion = _before_camera(clip.motion, rng)
     labels = [*common(0, motion), *lying(0, motion)]
     undecided = ALWAYS_OPEN | OPEN.get(clip.source, set())
@@ -148,8 +150,11 @@ def _before_camera(motion: Motion, rng: np.random.Generator) -> Motion:
 
 
 def _waves(motion: Motion) -> Iterator[Label]:
-    """Who is named as waving waves while a hand is up: from where its forearm, having come up, first turns, if it then
-    swings by as much as counts, twice. A wave of the wrist alone is none of these joints', and need not be told."""
+    """Label waves of a person named as waving, while a hand is up.
+
+    A wave begins where the raised forearm first turns, if it then swings far enough twice. A wave of the wrist alone is
+    not visible in these joints, so detecting it is optional.
+    """
     p, t = motion.positions, motion.times
     chest = p[:, J["spine3"], 2]
     for side, hand in (("left", Hand.LEFT), ("right", Hand.RIGHT)):
@@ -160,7 +165,7 @@ def _waves(motion: Motion) -> Iterator[Label]:
 
 
 def _swing(p: Floats, side: str) -> Floats:
-    """(T,) radians of a forearm from upright, towards the body's left, without jumps."""
+    """Return the angle of a forearm from upright, towards the body's left, unwrapped, (T,) radians."""
     across = [p[:, J[f"left_{joint}"], :2] - p[:, J[f"right_{joint}"], :2] for joint in ("hip", "shoulder")]
     left = across[0] + across[1]
     forearm = p[:, J[f"{side}_wrist"]] - p[:, J[f"{side}_elbow"]]
@@ -169,7 +174,8 @@ def _swing(p: Floats, side: str) -> Floats:
 
 
 def _turns(angle: Floats, swing: float) -> list[int]:
-    """The extremes of (T,) from which it goes away by ``swing``, and comes to from another: not the first and last."""
+    """Return the extremes of (T,) that are ``swing`` away from both the extreme before and the one after; not the first
+    and last."""
     turns, side, low, high = [], 0, 0, 0
     for k in range(len(angle)):
         low, high = (k if angle[k] < angle[low] else low), (k if angle[k] > angle[high] else high)
@@ -183,11 +189,11 @@ def _turns(angle: Floats, swing: float) -> list[int]:
 
 
 def _falls(motion: Motion) -> Iterator[Label]:
-    """Who is named as falling, and comes to lie, fell if they were on their feet shortly before."""
+    """Label falls: a person named as falling who lies down fell if they were on their feet shortly before."""
     hips, t = motion.root[:, 2], motion.times
     for label in lying(0, motion):
         before = (t >= label.start_s - FALL_S) & (t <= label.start_s)
-        # one who lies from the start, or from soon after, may have fallen before
+        # a person who lies from the start, or soon after, may have fallen before
         if label.start_s < FALL_S:
             yield label._replace(kind=EventKind.FELL, required=False)
         elif hips[before].max() > UP * hips.max():
@@ -195,8 +201,8 @@ def _falls(motion: Motion) -> Iterator[Label]:
 
 
 def run(bench: Bench) -> Result:
-    """Events of people in motion capture: of the split ``val`` those that chose the thresholds, else those that
-    measure."""
+    """Score events of people in motion capture. The split ``val`` has the people on whom the thresholds were chosen,
+    other splits those who measure."""
     totals: dict[str, dict[EventKind, Score]] = defaultdict(lambda: defaultdict(Score))
     by_clip: list[dict[str, Any]] = []
     clips, noise = (

@@ -1,6 +1,6 @@
-"""Fidelity: error of cleaned motion by the true speed of a joint, its noise, and the delay.
+"""Fidelity: error of cleaned motion by a joint's true speed, its noise, and the delay.
 
-A perfect input must stay unchanged. Bodies stand 3 m before a camera at the origin; noise is white and isotropic, or
+A noise-free input must stay unchanged. Bodies stand 3 m before a camera at the origin. Noise is white and isotropic, or
 three times as large along the line of sight. Swings of a forearm and of a leg measure the gain at single frequencies.
 """
 
@@ -33,11 +33,11 @@ DEPENDS_ON = CLEAN
 
 DELAYS = (0, 2, 4, 8, 16)
 SPEEDS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
-"""m/s, edges of the bins."""
+"""Edges of the speed bins, m/s."""
 CLIPS, FRAMES = 24, 90
 NOISES_M = (0.0, 0.002, 0.01, 0.02, 0.04)
 CAMERA = (3.0, 0.0, 1.2)
-"""Metres, from the place under the pelvis in the middle of a clip."""
+"""Camera position relative to the point below the pelvis in the middle of a clip, metres."""
 FREQUENCIES_HZ = (0.5, 1.0, 2.0, 3.0, 4.0)
 SWING_RAD = 0.5
 SWING_FRAMES, SWING_SCORED = 180, slice(45, 165)
@@ -48,9 +48,9 @@ class Swing(NamedTuple):
     """A limb that swings about a joint.
 
     Attributes:
-        pivot: the joint that turns.
-        moves: those below it.
-        axis: about which it turns, in the frame of the bone above, which in the rest pose has x forward and z up.
+        pivot: the joint that rotates.
+        moves: the joints below it.
+        axis: axis of rotation in the frame of the bone above, which in the rest pose has x forward and z up.
     """
 
     pivot: str
@@ -65,7 +65,7 @@ SWINGS = {
 
 
 def conditions(quick: bool) -> dict[str, Callable[[Floats, np.random.Generator], Floats]]:
-    """By name, corruptions of joints (T, C, 22, 3) before a camera at the origin."""
+    """Return corruptions of joints (T, C, 22, 3) before a camera at the origin, by name."""
     levels = (0.0, 0.01) if quick else NOISES_M
     same = {_noise_name(level): partial(_independent, level) for level in levels}
     more = {f"{_noise_name(level)}, depth x3": partial(_deep, level) for level in levels if level}
@@ -85,12 +85,12 @@ def _noise_name(level: float) -> str:
 
 
 def methods(bench: Bench) -> Methods:
-    """Filters, and what ships; the other variants are in the other protocols."""
+    """Return the filters and what ships. Other studies have the other variants."""
     return Methods(FILTERS, {"steadypose": PRODUCT["steadypose"]}, (0, 4) if bench.quick else DELAYS, networks=False)
 
 
 def run(bench: Bench) -> Result:
-    """Errors by speed, then swings."""
+    """Measure errors by speed, then swings."""
     clips = bench.clips(FRAMES, 6 if bench.quick else CLIPS)
     middle = clips.positions[FRAMES // 2, :, J["pelvis"]] * (1.0, 1.0, 0.0)
     truth = clips.positions - (middle + CAMERA)[:, None]
@@ -118,7 +118,8 @@ def _answered(
     number: int,
     title: str,
 ) -> tuple[list[Answer], list[dict[str, Any]]]:
-    """All methods, baselines tuned on every third clip with other noise; and what was tried."""
+    """Run all methods, with baselines tuned on every third clip with other noise; also return the evaluated
+    parameters."""
     stamps = np.arange(len(truth)) / FPS
     some = truth[:, ::3]
     tuning_observed = corrupt(some, np.random.default_rng((number, 1)))
@@ -143,7 +144,7 @@ def _mm(values: Floats) -> float:
 
 
 def _bins(speed: Floats) -> dict[str, NDArray[np.bool_]]:
-    """Masks of the bins, by name."""
+    """Return the masks of the speed bins, by name."""
     return {
         f"{low:g}-{high:g} m/s" if np.isfinite(high) else f"above {low:g}": (speed >= low) & (speed < high)
         for low, high in pairwise(SPEEDS)
@@ -151,7 +152,7 @@ def _bins(speed: Floats) -> dict[str, NDArray[np.bool_]]:
 
 
 def _by_speed(answer: Answer, truth: Floats, speed: Floats) -> dict[str, Any]:
-    """Figures of one method; ``by_speed`` has position, acceleration, and error found by deviation stated."""
+    """Return one method's figures; ``by_speed`` has position, acceleration, and the error-to-sigma ratio."""
     error, jerk = position_error(answer.positions, truth), acceleration_error(answer.positions, truth)
     bins: dict[str, dict[str, float]] = {}
     for name, mask in _bins(speed).items():
@@ -170,7 +171,7 @@ def _by_speed(answer: Answer, truth: Floats, speed: Floats) -> dict[str, Any]:
 
 
 def _by_clip(answer: Answer, truth: Floats) -> dict[str, list[float]]:
-    """Mean error of each clip, of what stands in the table of sources."""
+    """Return the mean errors of each clip for the table of sources."""
     if answer.method not in UNTUNED or answer.delay not in SUMMARISED:
         return {}
     error = position_error(answer.positions, truth)
@@ -178,7 +179,8 @@ def _by_clip(answer: Answer, truth: Floats) -> dict[str, list[float]]:
 
 
 def swinging(swing: Swing, frequency_hz: float) -> Floats:
-    """(T, 22, 3) metres: the rest skeleton standing before the camera, arms hanging and bent, one limb swinging."""
+    """Return the rest skeleton standing before the camera, arms hanging and bent, one limb swinging, (T, 22, 3)
+    metres."""
     turns = np.tile(np.eye(3), (SWING_FRAMES, len(PARENTS), 1, 1))
     for side, sign in (("left", 1.0), ("right", -1.0)):
         turns[:, J[f"{side}_shoulder"]] = Rotation.from_rotvec((-sign * 1.3, 0.0, 0.0)).as_matrix()
@@ -196,14 +198,14 @@ def swinging(swing: Swing, frequency_hz: float) -> Floats:
 
 
 def left_of_swing(answer: Floats, truth: Floats, frequency_hz: float) -> float:
-    """Amplitude of (T, ..., 3) at this frequency by that of the truth, whatever the phase."""
+    """Return the amplitude of (T, ..., 3) at this frequency relative to the truth, whatever the phase."""
     wave = np.exp(-2j * np.pi * frequency_hz * np.arange(len(truth)) / FPS)
     found, wanted = (np.linalg.norm(np.tensordot(wave, x - x.mean(axis=0), axes=1)) for x in (answer, truth))
     return float(found / wanted)
 
 
 def _swings(bench: Bench, compared: Methods) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """What every method leaves of every swing, side by side as clips."""
+    """Measure every method's gain for every swing, side by side as clips."""
     asked = [(limb, f) for limb in SWINGS for f in ((1.0, 3.0) if bench.quick else FREQUENCIES_HZ)]
     truth = np.stack([swinging(SWINGS[limb], f) for limb, f in asked], axis=1)
     records, tried = [], {}
@@ -255,11 +257,11 @@ def _slug(noise: str) -> str:
 
 UNTUNED = ("raw", "bank of smoothers", "whole-body bank", "steadypose")
 SUMMARISED = (0, 4)
-"""frames of delay in the README's table; the others are in the table of all"""
+"""Delays in the README's table, frames; the table of all has the others."""
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
-    """The best tuned filter, the banks and steadypose, by noise and delay: position / acceleration."""
+    """Build a table of the best tuned filter, the banks and steadypose, by noise and delay: position / acceleration."""
     noises = [name for name in dict.fromkeys(r["condition"] for r in records) if "depth" not in name]
     rows: list[list[str]] = []
     for delay in SUMMARISED:
@@ -280,7 +282,7 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
 
 
 def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: MotionClips) -> Table:
-    """The banks and steadypose."""
+    """Build a table of the banks and steadypose by source."""
     errors = {
         (r["condition"], r["method"]): 1e-3 * np.array(r["clips_mm"])
         for r in records
@@ -291,7 +293,7 @@ def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: Motio
 
 
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:
-    """Raw, the best tuned filter, the banks and steadypose, by noise and speed."""
+    """Build a table of raw, the best tuned filter, the banks and steadypose, by noise and speed."""
     bins = list(dict.fromkeys(name for record in records for name in record["by_speed"]))
     rows: list[list[str]] = []
     for condition in dict.fromkeys(record["condition"] for record in records):

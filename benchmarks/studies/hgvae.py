@@ -1,6 +1,6 @@
 """HG-VAE's tables, as in its paper, on our data: likelihood, anomalies, imputation.
 
-Windows of 50 frames of validation people. Nothing here is comparable with the paper's figures, which are on AMASS.
+Windows are 50 frames of validation people. The figures are not comparable with the paper's, which are on AMASS.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ RATES = (0.05, 0.01)
 
 
 def anomalies(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
-    """AUROC of every fault, by our score and the paper's, and false alarms among people not calibrated on."""
+    """Measure the AUROC of every fault, by steadypose's and the paper's score, and false alarms among people not used
+    for calibration."""
     count = 64 if bench.quick else 600
     rng = np.random.default_rng(11)
     windows, network = Windows(motion), load_fault_net("default")
@@ -96,7 +97,7 @@ def anomalies(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
 
 @torch.no_grad()
 def _paper_score(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
-    """(B,) log p(m) of the posterior's means, all levels."""
+    """Return log p(m) of the posterior's means, all levels, (B,)."""
     scores = []
     for start in range(0, len(seen), 256):
         rows = zip(seen[start : start + 256], sizes[start : start + 256], strict=True)
@@ -106,7 +107,8 @@ def _paper_score(model: HGVAE, seen: Floats, sizes: Floats) -> Floats:
 
 
 def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, motion: MotionSet) -> list[dict[str, Any]]:
-    """Of clean windows: of each validation person by a scale of the others, and of kinds of motion never seen."""
+    """Measure false alarms on clean windows: of each validation person with the others' scale, and of unseen kinds of
+    motion."""
     sigma, count = SENSORS["camera, 20 mm"], 128 if bench.quick else 4000
 
     def scored(some: MotionSet, windows: int) -> Scored:
@@ -114,7 +116,7 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, motion: MotionS
         positions, sizes = Windows(some).draw(windows, model.config.frames, rng)
         return score_windows(network, model, with_sensor_error(positions, sigma, rng), sizes, sigma)
 
-    if not len(motion.subject):  # the project's own people have no names
+    if not len(motion.subject):  # simulated people have no names
         return []
     people = {str(person): motion.only(motion.subject == person) for person in np.unique(motion.subject)}
     found = {p: scored(m, max(round(count * m.hours / motion.hours), 8)).odds.max(axis=1) for p, m in people.items()}
@@ -142,16 +144,16 @@ def _false_alarms(bench: Bench, network: FaultNet, model: HGVAE, motion: MotionS
 
 
 def _above(scores: Floats, limits: Floats) -> dict[str, float]:
-    """The share of ``scores`` (B, 1) above each of ``limits``, one for each of `RATES`."""
+    """Return the share of ``scores`` (B, 1) above each of ``limits``, one for each of `RATES`."""
     return {f"at_{rate:g}": float((scores > limit).mean()) for rate, limit in zip(RATES, limits, strict=True)}
 
 
 DEPENDS_ON = ("hgvae weights", "training.data.hgvae_windows", "training.networks.hgvae", "prior.models.hgvae")
-"""No table runs `pose/clean`."""
+"""What the results depend on. No table runs `pose/clean`."""
 
 
 def run(bench: Bench) -> Result:
-    """All tables and pictures."""
+    """Make all tables and plots."""
     model = load_network(HGVAE, HGVAEConfig.from_dict, "default", "hgvae")
     prepared = bench.data.is_file()
     motion = prepared_set(bench.data, "val") if prepared else as_set(bench.clips(90, 60))

@@ -12,13 +12,13 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, limbs
 
 Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]]
-"""From clean windows (B, T, 22, 3) to corrupted ones, and which of them (B,) contain the fault."""
+"""Maps clean windows (B, T, 22, 3) to corrupted ones, and returns which of them (B,) contain the fault."""
 
 HELD = "a joint frozen"
 BEGINS = 20
 """Frame in which a fault begins; it lasts to the window's end."""
 MIN_MOTION = 0.10
-"""Metres: a joint that would have moved less is indistinguishable from a frozen one."""
+"""Least motion of a frozen joint, metres; with less, it is indistinguishable from a still one."""
 
 _ARM, _LEG, *_ = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 _MOVERS = np.concatenate(limbs(("elbow", "wrist", "knee", "ankle")))
@@ -29,12 +29,12 @@ def _all(windows: Floats) -> NDArray[np.bool_]:
 
 
 def noise(windows: Floats, rng: np.random.Generator, sigma: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Independent noise along each axis."""
+    """Add independent noise along each axis."""
     return windows + rng.normal(0.0, sigma, windows.shape), _all(windows)
 
 
 def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
-    """Limbs of both sides exchanged from `BEGINS` on; a fault only where they are apart."""
+    """Swap limbs of both sides from `BEGINS` on; this counts as a fault only where they are apart."""
     del rng
     both = np.array([*limb, *MIRROR[limb]])
     out = windows.copy()
@@ -43,12 +43,12 @@ def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tup
 
 
 def frozen(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """One moving joint frozen at its position in the frame before `BEGINS`."""
+    """Freeze a moving joint at its position in the frame before `BEGINS`."""
     return held(windows, windows, rng)
 
 
 def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """`frozen` on noisy observations ``seen`` of ``windows``: the tracker repeats its last output."""
+    """Freeze a joint of noisy observations ``seen`` of ``windows``: the tracker repeats its last output."""
     out = seen.copy()
     moved = np.linalg.norm(windows[:, BEGINS:] - windows[:, BEGINS - 1 : BEGINS], axis=-1)[..., _MOVERS].max(axis=1)
     for k, by in enumerate(moved):
@@ -58,7 +58,7 @@ def held(seen: Floats, windows: Floats, rng: np.random.Generator) -> tuple[Float
 
 
 def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Bone lengths scaled independently by 0.6 to 1.6: not this person's skeleton."""
+    """Scale bone lengths independently by 0.6 to 1.6: another person's skeleton."""
     out = windows.copy()
     factor = np.exp(rng.uniform(np.log(0.6), np.log(1.6), (len(windows), 22)))
     for joint, parent in enumerate(PARENTS[1:], start=1):
@@ -69,7 +69,7 @@ def other_skeleton(windows: Floats, rng: np.random.Generator) -> tuple[Floats, N
 
 
 def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """From `BEGINS` on, an arm of another person, half a metre away."""
+    """Replace an arm from `BEGINS` on by another person's, half a metre away."""
     out = windows.copy()
     other = windows[rng.permutation(len(windows))]
     beside = windows[:, BEGINS:, :1] - other[:, BEGINS:, :1] + rng.normal(0.0, 0.3, (len(windows), 1, 1, 3))
@@ -78,19 +78,19 @@ def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Float
 
 
 def relabelled(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Left and right are taken for each other everywhere: the knees bend the wrong way."""
+    """Swap left and right everywhere: the knees bend the wrong way."""
     del rng
     return windows[:, :, MIRROR], _all(windows)
 
 
 def mirrored(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Mirrored: no fault."""
+    """Mirror the motion: no fault."""
     del rng
     return windows[:, :, MIRROR] * np.array([1.0, -1.0, 1.0]), _all(windows)
 
 
 def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
-    """Played backwards: mostly no fault."""
+    """Play backwards: usually no fault."""
     del rng
     return windows[:, ::-1].copy(), _all(windows)
 
@@ -99,7 +99,7 @@ FAULTS: Mapping[str, Fault] = {
     **{f"noise of {s} cm": partial(noise, sigma=s / 100) for s in (1, 2, 4, 8)},
     "arms exchanged": partial(exchanged, limb=_ARM),
     "legs exchanged": partial(exchanged, limb=_LEG),
-    HELD: frozen,  # the protocol repeats what was seen, its noise and all
+    HELD: frozen,  # the study repeats what was observed, including its noise
     "a joint at rest that should move": frozen,
     "left taken for right": relabelled,
     "another skeleton": other_skeleton,

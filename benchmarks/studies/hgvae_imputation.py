@@ -3,7 +3,8 @@
 Single entries, whole joints, or a limb for a time are hidden; every method gets the same windows. "mean" is the
 training mean of each track, "hold" the last observation, "line" linear interpolation in time, "guess" interpolation
 relative to the parent, "completion" the completion network's output, from which HG-VAE starts. The paper ascends log
-p(z | x) in the missing entries."""
+p(z | x) in the missing entries.
+"""
 
 from __future__ import annotations
 
@@ -34,30 +35,30 @@ from steadypose.training.weights import arrays_of
 Mask = NDArray[np.bool_]
 
 FEATURES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)
-"""Shares of all 3,300 entries."""
+"""Shares of all 3,300 entries that are hidden."""
 BURSTS_S = (0.1, 0.3, 0.5, 1.0)
 
 PAPER_RATE = 0.01
-"""Metres: Adam's rate for the entries, by its best result on windows of training."""
+"""Adam's learning rate for the entries, metres: the best on windows of training."""
 
 BIAS_SIGMA = 0.0
-"""Metres: the windows are clean."""
+"""Bias of the sensor, metres; the windows are clean."""
 
 
 def some_features(shape: tuple[int, int], rng: np.random.Generator, share: float) -> Mask:
-    """(66, T) entries hidden independently."""
+    """Hide entries (66, T) independently."""
     return rng.random(shape) < share
 
 
 def some_joints(shape: tuple[int, int], rng: np.random.Generator, count: int) -> Mask:
-    """(66, T) whole joints, all the time."""
+    """Hide whole joints (66, T) throughout the window."""
     hidden = np.zeros(shape, dtype=bool)
     hidden.reshape(22, 3, -1)[1 + rng.choice(21, count, replace=False)] = True
     return hidden
 
 
 def a_limb(shape: tuple[int, int], rng: np.random.Generator, seconds: float) -> Mask:
-    """(66, T) a lower arm or leg, for a while, somewhere in the window."""
+    """Hide a lower arm or leg (66, T) for some time, somewhere in the window."""
     hidden = np.zeros(shape, dtype=bool)
     length = round(seconds * 30)
     start = int(rng.integers(1, shape[1] - length))
@@ -75,13 +76,13 @@ CONDITIONS: Mapping[str, Callable[[tuple[int, int], np.random.Generator], Mask]]
 def impute_all(
     model: HGVAE, positions: Floats, sizes: Floats, masks: Mask, steps: tuple[int, ...]
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Every method over windows.
+    """Run every method over windows.
 
     Args:
         positions: (B, T, 22, 3) metres, complete.
-        sizes: (B,) of the bodies.
+        sizes: (B,) sizes of the bodies.
         masks: (B, 66, T) entries to hide.
-        steps: of the paper's gradient ascent.
+        steps: number of steps of the paper's gradient ascent.
 
     Returns:
         By method: (B, 66, T) tracks, and the truth in the same frame, metres of a standard body.
@@ -114,7 +115,7 @@ def impute_all(
 
 @torch.no_grad()
 def impute_whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: Mask) -> dict[str, Floats]:
-    """Windows (B, T, 22, 3) of which joints ``hidden`` (B, 22) are not seen at all, by methods that need one pass.
+    """Impute windows (B, T, 22, 3) whose joints ``hidden`` (B, 22) are never observed, by methods that need one pass.
 
     Returns:
         By method: (B,) squared errors in mm^2, summed over axes, frames and hidden joints.
@@ -135,12 +136,12 @@ def impute_whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: 
 
 
 def ascend_entries(model: HGVAE, start: Floats, observed: Mask, steps: int) -> Floats:
-    """The paper's imputation: Adam on the missing entries, up the score of section 7, keeping each window's best.
+    """Impute as in the paper: Adam on the missing entries maximises the score of section 7, keeping each window's best.
 
     Args:
-        start: (B, 66, T) metres, the entries observed and a guess of the others.
-        observed: (B, 66, T)
-        steps: of Adam.
+        start: (B, 66, T) metres, the observed entries and an initial guess of the others.
+        observed: (B, 66, T) valid mask.
+        steps: number of Adam's steps.
     """
     x = standardise(model, start)
     seen = torch.from_numpy(observed)
@@ -160,7 +161,7 @@ def ascend_entries(model: HGVAE, start: Floats, observed: Mask, steps: int) -> F
 
 
 def _held(track: Floats, observed: Mask, mean: Floats) -> Floats:
-    """(66, T) the last observation; before the first, that one; the mean where there is none."""
+    """Hold the last observation (66, T); before the first, hold the first; use the mean if there is none."""
     last = np.maximum.accumulate(np.where(observed, np.arange(track.shape[1]), -1), axis=1)
     first = np.where(observed.any(axis=1), observed.argmax(axis=1), 0)[:, None]
     held = np.take_along_axis(track, np.where(last < 0, first, last), axis=1)
@@ -176,23 +177,22 @@ def _line(track: Floats, observed: Mask, mean: Floats) -> Floats:
 
 
 def _guess(window: Floats, size: float, clean: Tracks, observed: Mask, line: Floats) -> Floats:
-    """The interpolation of `to_tracks` for hidden joints, in the frame of the clean window; linear for single
-    entries."""
+    """Interpolate hidden joints as `to_tracks` does, in the frame of the clean window; single entries linearly."""
     joints = observed.reshape(22, 3, -1)
     if (joints != joints[:, :1]).any():
         return line
     seen = np.where(joints[:, 0].T[..., None], window, np.nan)
     tracks = to_tracks(seen, size)
     guessed = in_frame_of(clean, from_tracks(tracks.x, tracks, size), size)
-    return np.where(observed, clean.x, guessed)  # NaN for a joint never seen: the model hangs it from the one above
+    return np.where(observed, clean.x, guessed)  # NaN if never observed: the model uses the one above
 
 
 def sweep(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
-    """Squared error of imputation, every method, every degree of occlusion."""
+    """Measure the squared error of imputation for every method and every degree of occlusion."""
     windows = Windows(motion)
     records: list[dict[str, Any]] = []
     for condition, hide in bench.progress.track(CONDITIONS.items(), description="imputation", total=len(CONDITIONS)):
-        # which joint is hidden matters more than how: a hundred windows are too few to tell
+        # which joint is hidden matters more than how, and a hundred windows are too few to tell
         whole = "whole" in condition
         count = 4 if bench.quick else 512 if whole else 96
         rng = np.random.default_rng(17)
@@ -235,11 +235,11 @@ def sweep(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
 
 
 FOUR_JOINTS_DRAWS = 8
-"""of four joints of each window; of one joint, each has its turn"""
+"""Number of draws of four joints in each window; single joints are each hidden in turn."""
 
 
 def whole_joints(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
-    """Whole joints hidden in every window of the validation people, one after the other, and by person."""
+    """Measure whole joints hidden in every window of the validation people, one after the other, and by person."""
     people = motion.subject if len(motion.subject) else np.full(len(motion.clip_start) - 1, "all")
     frames = model.config.frames
     rows = motion.all_windows(frames, frames)[:: 40 if bench.quick else 1]

@@ -1,8 +1,9 @@
-"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, limbs away for 0.2 to 2 seconds, and never
-seen.
+"""Hidden joints: below 0.9 m (HuMoR's occlusion), an arm behind the trunk, limbs missing for 0.2 to 2 seconds, and
+joints never observed.
 
-Seen joints carry 1 cm of noise. But for joints never seen, for which a filter has no answer, each clip begins with half
-a second in which everything is seen. HuMoR scores 43 points on the body's surface; these are 22 joints.
+Observed joints carry 1 cm of noise. Each clip begins with half a second in which everything is observed, except for
+joints never observed, which a filter cannot estimate. HuMoR scores 43 points on the body's surface; this study scores
+22 joints.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ BESIDE = "held beside the body"
 GAUSSIAN = "conditional Gaussian"
 FILTER = "Kalman, whole body"
 KNOW_THE_BODY = (BESIDE, GAUSSIAN, FILTER)
-"""Baselines that a filter of each joint is not."""
+"""Baselines that use the whole body, unlike a filter for each joint."""
 
 NOISE = 0.01
-"""Metres."""
+"""Standard deviation of the noise, metres."""
 SEEN_FIRST = 15
-"""Frames."""
+"""Number of frames at the start in which everything is observed."""
 BURSTS_S = (0.2, 0.5, 1.0, 2.0)
 
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
 _ARM = limbs(("shoulder", "elbow", "wrist"))[0]
-"""What of a body is never seen: behind a counter, or out of the picture."""
+"""Joints that are never observed: behind a counter, or out of the image."""
 
 
 def _masked(
@@ -84,7 +85,7 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def run(bench: Bench) -> Result:
-    """Every method in every condition."""
+    """Run every method in every condition."""
     clips = bench.clips()
     kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
@@ -131,13 +132,15 @@ def run(bench: Bench) -> Result:
 
 
 def given_the_seen(seen: Floats, stamps_s: Floats, delay: int, gaussian: ConditionalGaussian) -> Floats:
-    """The input; a hidden joint at its conditional mean, or held beside the body where that has no frame to be in."""
+    """Return the input, with a hidden joint at its conditional mean, or held in the body frame where the body's heading
+    is unknown."""
     found = gaussian(seen)
     return np.where(np.isfinite(found), found, beside(seen, stamps_s, delay))
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
-    """Hidden joints, mm: the nearest baseline that does not know the body, those that do, and steadypose."""
+    """Build a table of hidden joints, mm: the best baseline that does not use the whole body, those that do, and
+    steadypose."""
     conditions = list(dict.fromkeys(r["condition"] for r in records))
     rows: list[list[str]] = []
     for delay in (0, 4):
@@ -149,7 +152,7 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
                     mine = [r for r in mine if r["method"] not in (*PRODUCT, *KNOW_THE_BODY)]
                 else:
                     mine = [r for r in mine if r["method"] == name and r["delay"] in (delay, 0)][-1:]
-                found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no answer
+                found = [r["hidden_mm"] for r in mine if "hidden_mm" in r]  # raw has no estimate
                 cells.append(f"{min(found):.0f}" if found else "–")
             rows.append([f"delay {delay}: {name}", *cells])
     return Table("hidden_joints-summary", "Hidden joints: their error, mm", ["method", *conditions], rows, note)

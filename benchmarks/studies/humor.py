@@ -1,8 +1,9 @@
 """HuMoR's tables on our data: futures, noisy and hidden joints, a simulated detector, simulated depth; and figure 8.
 
 The figures are not comparable with the paper's, whose data are AMASS and whose body is SMPL; the order of the methods
-is. Ablations are trained alike and briefly, so the model that ships has a copy trained as briefly beside it. Contact is
-load, of eight joints; the paper's ninth, the hips, never bears any."""
+is. Ablations are trained alike and briefly, so a copy of the model that ships, trained as briefly, stands beside it.
+Contact is load, of eight joints; the paper's ninth, the hips, never bears any.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ from steadypose.training.data.dataset import MotionSet
 from steadypose.training.recipes.humor import Sequences, recipe_of
 
 STEPS, BATCH, LEARNING_RATE, EVALUATIONS = 250, 64, 1e-3, 5
-"""Of a brief training: a forty-eighth of the sequences that what ships has seen."""
+"""Steps, batch, learning rate and evaluations of a brief training: a forty-eighth of the sequences on which the shipped
+model was trained."""
 
 SHIPS, MVAE = "HuMoR, as it ships", "MVAE-like: none of the three"
 BRIEF = "HuMoR, briefly trained"
@@ -60,19 +62,19 @@ VARIANTS: Mapping[str, HumorConfig] = {
     "no contacts": HumorConfig(contacts=False),
     MVAE: HumorConfig(learned_prior=False, residual=False, contacts=False),
 }
-"""As the paper names them; without SMPL, it has one more: joints that need not be those of a body."""
+"""Variants, named as in the paper. Without SMPL, there is one more: joints that need not be those of a body."""
 
 
 def shipped() -> HumorNet:
-    """The default weights."""
+    """Return the default weights."""
     return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")
 
 
 def model_of(bench: Bench, name: str) -> HumorNet:
-    """One of `VARIANTS`, trained now, or found in ``runs`` from an earlier call; or what ships."""
+    """Return one of `VARIANTS`, trained now or loaded from ``runs``, or the model that ships."""
     if name == SHIPS:
         return shipped()
-    bench.progress.stop()  # training draws a bar of its own
+    bench.progress.stop()  # training draws its own progress bar
     try:
         config = VARIANTS[name]
         if bench.quick or not bench.data.is_file():
@@ -94,24 +96,24 @@ def _trained(config: HumorConfig, train: MotionSet, val: MotionSet, runs: Path, 
         recipe = replace(recipe, batch=BATCH, rate=LEARNING_RATE, evaluations=EVALUATIONS)
         torch.manual_seed(0)
         model = HumorNet(config)
-        model.load_state_dict(dict(shipped().named_buffers()), strict=False)  # fitting them anew takes a minute
+        model.load_state_dict(dict(shipped().named_buffers()), strict=False)  # fitting them again takes a minute
         run = recipe.minimise(model, path.parent, steps, seed=0)
         run.save(path, model, asdict(config), {"Training": f"{steps} steps of {BATCH} sequences, for the bench"})
     return load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")
 
 
 SAMPLES, LONG_S = 50, 5.0
-"""As in the paper."""
+"""Number of samples, and length of long futures in seconds, as in the paper."""
 
 SPARED = 4
-"""Times fewer samples are drawn of the long futures: pairs are many."""
+"""Factor by which fewer samples are drawn of the long futures, because pairs are many."""
 
 LOWEST_M, HIGHEST_M = 0.1, 1.6
-"""Of a pelvis: a future in which it is ever lower or higher has gone astray. None of the truth has."""
+"""Lowest and highest pelvis, metres. A future that ever leaves this range has diverged; the truth never does."""
 
 
 def initial_states(clips: MotionClips) -> tuple[State, State, Tensor]:
-    """First states (C,), all that follow (C, T), of people on their bones, and these bones."""
+    """Return first states (C,), all that follow (C, T), of people on their bones, and these bones."""
     root, rotations = (
         torch.from_numpy(np.ascontiguousarray(values.swapaxes(0, 1))).float()
         for values in (clips.positions[:, :, 0], clips.rotations)
@@ -123,7 +125,7 @@ def initial_states(clips: MotionClips) -> tuple[State, State, Tensor]:
 
 @torch.no_grad()
 def predict(model: HumorNet, clips: MotionClips, samples: int) -> dict[str, Any]:
-    """Figures of Table 1 for one model; clips of a little over two seconds."""
+    """Return the figures of Table 1 for one model; clips are a little over two seconds long."""
     first, truth, offsets = initial_states(clips)
     steps = truth.root.shape[1]
     generator = torch.Generator().manual_seed(0)
@@ -150,7 +152,7 @@ def predict(model: HumorNet, clips: MotionClips, samples: int) -> dict[str, Any]
 
 
 def stand_still(clips: MotionClips) -> dict[str, Any]:
-    """The same of a body that stays as it is, the plainest guess."""
+    """Return the same figures for a body that does not move, the simplest prediction."""
     first, truth, _ = initial_states(clips)
     error = (first.joints.unsqueeze(1) - truth.joints).norm(dim=-1).mean(dim=-1)
     return {"ade_mm": _mm(error.mean()), "fde_mm": _mm(error[:, -1].mean()), "likeliest_ade_mm": _mm(error.mean())}
@@ -161,7 +163,7 @@ def _times(state: State, count: int) -> State:
 
 
 def _pairwise(joints: Tensor) -> Tensor:
-    """Mean distance of joints (C, S, T, 22, 3) between all pairs of samples."""
+    """Return the mean distance of joints (C, S, T, 22, 3) between all pairs of samples."""
     first, second = torch.triu_indices(joints.shape[1], joints.shape[1], offset=1)
     return torch.stack([(clip[first] - clip[second]).norm(dim=-1).mean() for clip in joints]).mean()
 
@@ -179,16 +181,17 @@ DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit", "training.recipes.humor")
 
 FRAMES = 90
 DELAY = 8
-"""Frames: of the live answer that fits start from."""
+"""Delay of the live output from which fits start, frames."""
 CLIPS, PICTURES, FUTURES, CREDIT = 4, 8, 12, 16
-"""Clips of Table 2, of Tables 3 and 4, of Table 1, and of `credit`, taken evenly from all sources of the split."""
+"""Number of clips of Table 2, of Tables 3 and 4, of Table 1, and of `credit`, taken evenly from all sources of the
+split."""
 
 _STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
 _PER_FRAME = "per-frame fit, smoothed (stage 2)"
 
 
 def run(bench: Bench) -> Result:
-    """All tables."""
+    """Make all tables."""
     models = {SHIPS: model_of(bench, SHIPS)} | {name: model_of(bench, name) for name in VARIANTS}
     count = 2 if bench.quick else FUTURES
     clips = bench.clips(62, count)
@@ -220,7 +223,7 @@ def run(bench: Bench) -> Result:
 
 
 def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bool) -> list[dict[str, Any]]:
-    """Table 2: all joints with noise; or with ``hide``, without noise, those below `HIDDEN_BELOW` hidden."""
+    """Make Table 2: all joints with noise; with ``hide``, without noise and joints below `HIDDEN_BELOW` hidden."""
     truth = clips.positions
     seen = corrupted(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)), seed=0)
     live = {delay: _live(clips, seen, delay) for delay in (4, DELAY)}
@@ -239,12 +242,12 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bo
 
 
 def _live(clips: MotionClips, seen: Floats, delay: int) -> Floats:
-    """What `clean` says of clips (T, C, 22, 3) as they come in."""
+    """Return `clean`'s live output for clips (T, C, 22, 3)."""
     return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay).positions[-FRAMES:]
 
 
 def _fits(models: dict[str, Any], name: str, start: Floats, seen: Floats) -> list[Answer]:
-    """By one model or without one, of each of C clips, ``start`` and ``seen`` (T, C, 22, 3)."""
+    """Fit each of C clips with one model or without one; ``start`` and ``seen`` (T, C, 22, 3)."""
     model, stages = (models[SHIPS], 2) if name == _PER_FRAME else (models[name], 3)
     return [
         fitted(model, [start_of(start[:, c])], seen_joints(seen[:, c]), stages, FitSettings())
@@ -253,7 +256,7 @@ def _fits(models: dict[str, Any], name: str, start: Floats, seen: Floats) -> lis
 
 
 def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth: bool) -> list[dict[str, Any]]:
-    """Tables 3 and 4: key points of a simulated detector, alone or with the points of a simulated depth camera."""
+    """Make Tables 3 and 4: key points of a simulated detector, alone or with the points of a simulated depth camera."""
     taken = [pictures(clips, c, np.random.default_rng((1, c))) for c in range(len(clips.offsets))]
     truth = np.stack([picture.truth for picture in taken], axis=1)
     unseen = np.stack([~picture.seen for picture in taken], axis=1)

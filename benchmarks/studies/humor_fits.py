@@ -35,31 +35,31 @@ from steadypose.prior.fit.windows import Track, load_of
 from steadypose.prior.timing.rate import FPS
 
 NOISE, HIDDEN_BELOW = 0.04, 0.9
-"""Metres: HuMoR's noise of joints, and the height below which nothing is seen."""
+"""HuMoR's noise of joints, and the height below which joints are hidden, metres."""
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 TOES = [J["left_foot"], J["right_foot"]]
 DEPTHS = np.arange(0.0, 0.151, 0.03)
-"""Metres, of penetration: HuMoR's thresholds."""
+"""HuMoR's thresholds of penetration, metres."""
 
 FOCAL, CENTRE = 900.0, (640.0, 360.0)
 CAMERA_HEIGHT, AWAY = 1.3, 4.5
-"""Metres: a level camera, and how far away from it a clip is in the mean."""
+"""Height of a level camera, and its mean distance from a clip, metres."""
 PIXELS, MISSED, WRONG, WRONG_PIXELS = 5.0, 0.1, 0.02, 60.0
-"""A detector: noise, share of key points missed, and share taken for something else, by how much."""
+"""A detector's errors: noise in pixels, share of missed key points, share of wrong ones, and their error in pixels."""
 
 POINTS = 200
-"""Of the surface, a frame."""
+"""Number of surface points per frame."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Of a method, for one clip.
+    """Estimate of a method for one clip.
 
     Attributes:
         joints: (T, 22, 3) metres, world.
         load: (T, 8) probabilities, or None.
-        seconds: of a processor, that it took; None of methods that take all clips at once.
+        seconds: processor time; None for methods that process all clips together.
     """
 
     joints: Floats
@@ -68,20 +68,21 @@ class Answer:
 
 
 def start_of(positions: Floats) -> Start:
-    """Where ``steadypose fit`` starts on joints in space, of what `clean` says (T, 22, 3); the floor is known."""
+    """Return where ``steadypose fit`` starts for joints in space, from `clean`'s output (T, 22, 3); the floor is
+    known."""
     offsets = estimate_offsets(positions)
     return Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, ground_known=True)
 
 
 def seen_joints(seen: Floats) -> list[Observed]:
-    """Of (T, 22, 3) metres, NaN where hidden."""
+    """Return observations from (T, 22, 3) metres, NaN where hidden."""
     return [SeenJoints(float_tensor(seen), torch.full(seen.shape[:-1], noise_of(seen)))]
 
 
 def fitted(
     model: HumorNet, starts: Sequence[Start], observed: Sequence[Observed], stages: int, settings: FitSettings
 ) -> Answer:
-    """The fit of least energy from any start."""
+    """Return the fit of least energy over all starts."""
     began = time.process_time()
     found = [fit_window(model, start, observed, settings, stages=stages) for start in starts]
     best = min(found, key=lambda fit: fit.energies[-1])
@@ -94,13 +95,13 @@ def fitted(
 
 @dataclass(frozen=True)
 class Pictures:
-    """A clip as a level camera takes it.
+    """A clip observed by a level camera.
 
     Attributes:
-        truth: (T, 22, 3) metres, in a frame that is z up, the camera at 0.
-        seen: (T, 22) which joints a detector found.
+        truth: (T, 22, 3) metres, in a frame with z up and the camera at 0.
+        seen: (T, 22) which joints the detector detected.
         flat: its key points.
-        deep: these with points of a depth camera.
+        deep: the key points with points of a depth camera.
     """
 
     truth: Floats
@@ -144,20 +145,20 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
 
 
 def camera_settings() -> FitSettings:
-    """As ``steadypose fit`` has them for a camera whose height is known."""
+    """Return the settings of ``steadypose fit`` for a camera of known height."""
     return replace(PICTURES, ground_height_sigma=0.05)
 
 
 def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], contacts: NDArray[np.bool_],
            floor: float = 0.0) -> dict[str, Any]:  # fmt: skip
-    """Figures of Table 2 over clips.
+    """Return the figures of Table 2 over clips.
 
     Args:
-        answers: (C,)
+        answers: (C,) estimates.
         truth: (T, C, 22, 3) metres.
-        hidden: (T, C, 22) what was not seen.
+        hidden: (T, C, 22) which joints were hidden.
         contacts: (T, C, 8) true labels of load.
-        floor: metres, its height.
+        floor: height of the floor, metres.
     """
     said = np.stack([answer.joints for answer in answers], axis=1)
     error = position_error(said, truth)
@@ -184,7 +185,7 @@ def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], 
 
 
 def load_labels(clips: MotionClips) -> NDArray[np.bool_]:
-    """(T, C, 8) what bears load in truth."""
+    """Return the true labels of load, (T, C, 8)."""
     clip_count = clips.positions.shape[1]
     return np.stack([label_contacts(clips.positions[:, c], FPS, LOAD_SPEED) for c in range(clip_count)], axis=1)
 
@@ -195,7 +196,7 @@ def _mm(values: Floats) -> float | None:
 
 
 SMOOTH = (4.0, 8.0, 16.0, 32.0, 64.0)
-"""m/s², of stage 2."""
+"""Smoothness of stage 2, m/s²."""
 DELAY = 8
 CONDITIONS = {"4 cm of noise": (NOISE, 0.0), "hidden below 0.9 m": (0.0, HIDDEN_BELOW)}
 AS_IT_SHIPS, STAGE_2 = "as it ships", "stage 2 alone, tuned"
@@ -210,7 +211,8 @@ CREDIT_VARIANTS: Mapping[str, FitSettings] = {
 
 
 def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, Any]]:
-    """A record for each condition and variant: millimetres a person, and what it adds to the fit as it ships."""
+    """Return a record for each condition and variant: millimetres per person, and the difference from the fit as it
+    ships."""
     records = []
     for condition, (noise, below) in CONDITIONS.items():
         seen, tuning = (corrupted(clips.positions, noise, below, seed) for seed in (0, 1))
@@ -246,7 +248,7 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
 
 
 def corrupted(truth: Floats, noise: float, below: float, seed: int) -> Floats:
-    """(T, C, 22, 3) with noise, metres, and NaN where truth is lower than ``below``, metres."""
+    """Add noise to (T, C, 22, 3), metres, and hide joints whose truth is lower than ``below``, metres."""
     seen = truth + noise * np.random.default_rng(seed).standard_normal(truth.shape)
     seen[truth[..., 2] < below] = np.nan
     return seen
@@ -256,7 +258,7 @@ def errors(
     model: HumorNet, clips: MotionClips, starts: Floats, seen: Floats, settings: FitSettings, stages: int,
     which: Iterable[int],
 ) -> Floats:  # fmt: skip
-    """Metres, of each of some clips: of the joints that were hidden where any are, else of all."""
+    """Return the errors of each clip, metres: of the hidden joints if there are any, otherwise of all."""
     found = []
     for c in which:
         answer = fitted(model, [start_of(starts[:, c])], seen_joints(seen[:, c]), stages, settings)
@@ -266,7 +268,7 @@ def errors(
 
 
 def credit_table(records: Sequence[Mapping[str, Any]], clips: int) -> Table:
-    """A row a condition and variant."""
+    """Build a table with a row for each condition and variant."""
     return Table(
         "humor-credit",
         "What the fit owes to HuMoR: error of joints, of hidden ones where some are, mm",
