@@ -1,9 +1,9 @@
-"""Motion between two ends (HM-VAE, table 2): gaps of 5 to 45 frames, 10 frames known before and one after.
+"""Motion between two ends (HM-VAE, table 2): gaps of 5 to 45 frames, with 10 known frames before and one after.
 
-The protocol of LAFAN1 (Harvey et al. 2020) on our motion, with its figures: L2Q of global rotations, L2P of global
-joints by the deviation that each has in training, NPSS. LAFAN1 itself is not our data, and its figures are of other
-motion on another skeleton; what can be compared is the ratio to slerp's and lerp's. Of a few clips, HM-VAE is searched
-too, as in the paper's section 4.
+The protocol and figures are LAFAN1's (Harvey et al. 2020): L2Q of global rotations, L2P of global joints normalised by
+each joint's deviation in training, and NPSS. Our motion and skeleton differ from LAFAN1's protocol, so only ratios to
+slerp and lerp are comparable with its figures. On a few clips, HM-VAE's latents are also searched, as in the paper's
+section 4.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ DEPENDS_ON = (COMPLETE, "completer weights", "hmvae64 weights", "prior.fit.optim
 GAPS = (5, 15, 30, 45)
 BEFORE, AFTER = 10, 1
 SEARCHED = 8
-"""Clips on which HM-VAE is searched, which takes seconds for each."""
+"""Number of clips on which HM-VAE is searched, which takes seconds for each."""
 FRAMES = BEFORE + max(GAPS) + AFTER
 
 _FEET = [k for k, joint in enumerate(CONTACT_JOINTS) if JOINTS[joint].endswith(("ankle", "foot"))]
@@ -50,8 +50,8 @@ class Truth(NamedTuple):
         positions: (C, T, 22, 3) metres.
         rotations: (C, T, 22, 3, 3) local.
         offsets: (C, 22, 3) metres, bones.
-        contacts: (C, T, 8) of `CONTACT_JOINTS`.
-        gap: its frames.
+        contacts: (C, T, 8) labels of `CONTACT_JOINTS`.
+        gap: frames of the gap.
     """
 
     positions: Floats
@@ -62,7 +62,7 @@ class Truth(NamedTuple):
 
     @classmethod
     def of(cls, clips: MotionClips, gap: int) -> Truth:
-        """The first frames of clips, with joints placed by forward kinematics."""
+        """Take the first frames of clips, with joints placed by forward kinematics."""
         rows = slice(0, BEFORE + gap + AFTER)
         rotations = clips.rotations[rows].swapaxes(0, 1)
         joints = place_joints(rotations, clips.offsets[:, None]) + clips.positions[rows].swapaxes(0, 1)[:, :, :1]
@@ -70,20 +70,20 @@ class Truth(NamedTuple):
         return cls(joints, rotations, clips.offsets, contacts, slice(BEFORE, BEFORE + gap))
 
     def some(self, count: int) -> Truth:
-        """``count`` of the clips, spread evenly."""
+        """Return ``count`` of the clips, spread evenly."""
         clips = np.unique(np.linspace(0, len(self.offsets) - 1, count).round().astype(int))
         return Truth(self.positions[clips], self.rotations[clips], self.offsets[clips], self.contacts[clips], self.gap)
 
     @property
     def given(self) -> Floats:
-        """(C, T, 22, 3) metres, the joints, NaN in the gap."""
+        """Joints (C, T, 22, 3) metres, NaN in the gap."""
         given = self.positions.copy()
         given[:, self.gap] = np.nan
         return given
 
 
 def run(bench: Bench) -> Result:
-    """Every method over every gap."""
+    """Run every method over every gap."""
     clips = bench.clips(FRAMES, 96)
     train = prepared_set(bench.data, "train") if bench.data.is_file() else as_set(bench.training_clips())
     deviation = place_deviation(train)
@@ -117,7 +117,8 @@ def run(bench: Bench) -> Result:
 
 
 def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
-    """(22, 3) metres: standard deviations of joints over training windows, in the root's frame before a gap."""
+    """Return the standard deviations (22, 3) of joints over training windows, in the root's frame before a gap,
+    metres."""
     rows = train.all_windows(FRAMES, 7)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, windows).round().astype(int))]
     joints = train.positions[rows].double().numpy()
@@ -127,13 +128,13 @@ def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
 
 
 def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) -> dict[str, Any]:
-    """Figures of an answer in the gap; accelerations across its ends.
+    """Return the figures of an estimate in the gap; accelerations include the gap's ends.
 
     Args:
         truth: C clips of T frames.
-        rotations: (C, T, 22, 3, 3) local, the answer's.
-        root: (C, T, 3) metres, the answer's.
-        deviation: (22, 3) metres, as of `place_deviation`, by which L2P is normalised.
+        rotations: (C, T, 22, 3, 3) local, estimated.
+        root: (C, T, 3) metres, estimated.
+        deviation: (22, 3) metres from `place_deviation`, by which L2P is normalised.
     """
     joints = place_joints(rotations, truth.offsets[:, None]) + root[:, :, None]
     gap = truth.gap
@@ -183,7 +184,8 @@ def relate(records: list[dict[str, Any]]) -> None:
 
 
 def search(bench: Bench, clips: MotionClips, completer: LiveCompleter, deviation: Floats) -> list[dict[str, Any]]:
-    """Section 4 beside its start, on `SEARCHED` clips, from the completer's answer or from random latents."""
+    """Run section 4's search on `SEARCHED` clips, from the completer's output and from random latents, beside its
+    start."""
     parts = PartsCompleter(completer)
     fills: dict[str, Fill] = {
         "completer": completer,

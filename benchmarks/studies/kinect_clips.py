@@ -1,8 +1,9 @@
-"""Clips of a Kinect beside Vicon (UI-PRMD), and scores against Vicon: one rotation and translation a clip, then a
-constant offset a joint in the trunk's frame.
+"""Clips of a Kinect beside Vicon (UI-PRMD), and scores against Vicon.
 
-The offset is learned on other people: what is left of it is what differs between persons, and is most of the error of
-a method that knows nothing of it. So each clip is scored a second time with its own offset."""
+An estimate is aligned by one rotation and translation per clip, then by a constant offset per joint in the trunk's
+frame. The offset is learned on other people. The rest of it, which differs between persons, is most of the error of a
+method that does not know it. So each clip is also scored with its own offset.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +34,12 @@ from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS
 SUBJECTS = TRAIN_SUBJECTS + VALIDATION_SUBJECTS
 
 OUT_OF_STEP = ("s01",)
-"""Whose Kinect and Vicon do not agree in time, as all others' do: of 12 % of s01's clips the best lag is three frames
-or more. What is measured there is the lag; no mean counts them."""
+"""People whose Kinect and Vicon are not synchronised. For 12 % of s01's clips the best lag is three frames or more. Its
+error measures the lag, so no mean includes it."""
 
 SIDED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 SCORED = ("head", *(f"{side}_{joint}" for joint in SIDED for side in ("left", "right")))
-"""The 13 joints that are scored: those that both systems have and that are points of the body."""
+"""The 13 scored joints: those that both systems have and that are points of the body."""
 OTHER_SIDE = tuple(SCORED.index(JOINTS[MIRROR[J[name]]]) for name in SCORED)
 BONES = tuple(
     (SCORED.index(f"{side}_{a}"), SCORED.index(f"{side}_{b}"))
@@ -54,7 +55,8 @@ MARKERS = {
     **{f"{side}_knee": (f"{s}KNE",) for side, s in (("left", "L"), ("right", "R"))},
     **{f"{side}_ankle": (f"{s}ANK",) for side, s in (("left", "L"), ("right", "R"))},
 }
-"""The skin markers nearest to each joint: a second truth, to compare with work that did not find joint centres."""
+"""The skin markers nearest to each joint: a second truth, for comparison with work that did not compute joint
+centres."""
 
 
 class Clip(NamedTuple):
@@ -63,13 +65,13 @@ class Clip(NamedTuple):
     name: str
     subject: str
     kinect: Floats  # (T, 22, 3) metres, skeleton kinect22, z up
-    raw: Floats  # (T, 13, 3) metres, the scored joints of it
+    raw: Floats  # (T, 13, 3) metres, its scored joints
     centres: Floats  # (T, 13, 3) metres, the truth
     markers: Floats  # (T, 13, 3) metres, the other truth
 
 
 def read_clips(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
-    """Every n-th clip of each of these subjects."""
+    """Read every n-th clip of each of these subjects."""
     with np.load(path) as archive:
         marker_names = [str(name) for name in archive["vicon_names"]]
     return [_clip(pair, marker_names) for subject in subjects for pair in load_pairs(path, (subject,))[::every]]
@@ -84,7 +86,7 @@ def _clip(pair: KinectPair, marker_names: Sequence[str]) -> Clip:
 
 
 def side_by_side(clips: Sequence[Floats]) -> Floats:
-    """(T, C, J, 3) of clips (T, J, 3) of different lengths, NaN after their ends."""
+    """Stack clips (T, J, 3) of different lengths into (T, C, J, 3), NaN after their ends."""
     batch = np.full((max(map(len, clips)), len(clips), *clips[0].shape[1:]), np.nan)
     for number, clip in enumerate(clips):
         batch[: len(clip), number] = clip
@@ -92,30 +94,31 @@ def side_by_side(clips: Sequence[Floats]) -> Floats:
 
 
 OFF = 0.10
-"""Metres: an error that the stated standard deviation should indicate."""
+"""Error that the predicted standard deviation should indicate, metres."""
 WORST = 0.1
 """Share of frames, the worst by mean error, that the anomaly should indicate."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What a method gets, one number a clip."""
+    """Scores of a method, one number per clip."""
 
     position: Floats  # (C,) metres
-    moving: Floats  # (C,) metres, with the offset of this very clip: what of the error changes with the pose
+    moving: Floats  # (C,) metres, with this clip's own offset: the part of the error that changes with the pose
     acceleration: Floats  # (C,) metres/frame²
     variation: Floats  # (C,) of bone lengths, relative
     joints: Floats  # (13,) metres, mean over the frames of all clips
 
 
 def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
-    """(13, 3) metres in the trunk's frame: what, added to aligned estimates, brings each joint to the truth."""
+    """Return the offset (13, 3) in the trunk's frame that moves aligned estimates of each joint to the truth,
+    metres."""
     pairs = zip(truths, aligned, strict=True)
     return np.nanmean(np.concatenate([np.einsum("tba,tjb->tja", _trunk(a), t - a) for t, a in pairs]), axis=0)
 
 
 def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -> Scores:
-    """Errors of each clip, of aligned estimates moved by the offset."""
+    """Score each clip's aligned estimate, moved by the offset."""
     errors, moving, acceleration, variation = [], [], [], []
     for truth, estimate in zip(truths, aligned, strict=True):
         placed = move(estimate, offset)
@@ -133,7 +136,7 @@ def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -
 
 
 def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]:
-    """Each clip's estimate, turned and moved as a whole to lie nearest to the truth."""
+    """Rotate and translate each clip's estimate as a whole to be nearest to the truth."""
     aligned = []
     for truth, estimate in zip(truths, estimates, strict=True):
         rotation, translation = rigid_alignment(estimate, truth)
@@ -142,7 +145,7 @@ def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]
 
 
 def move(estimate: Floats, offset: Floats) -> Floats:
-    """(T, 13, 3) the estimate with a constant offset (13, 3) in the trunk's frame."""
+    """Add a constant offset (13, 3) in the trunk's frame to an estimate (T, 13, 3)."""
     return estimate + np.einsum("tab,jb->tja", _trunk(estimate), offset)
 
 
@@ -152,7 +155,7 @@ def _trunk(positions: Floats) -> Floats:
 
 
 def quick_score(clips: Sequence[Clip], answers: Sequence[Floats]) -> dict[str, float]:
-    """Errors (mm, mm/frame²) with the offset learned on these very clips: for tuning."""
+    """Return errors (mm, mm/frame²) with the offset learned on the same clips, for tuning."""
     truths = [clip.centres for clip in clips]
     aligned = align(truths, answers)
     scores = score(truths, aligned, learn_offset(truths, aligned))
@@ -164,9 +167,9 @@ def _mm(values: Floats) -> float:
 
 
 def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
-    """Figures of a method: millimetres, millimetres/frame², per cent; of each subject, and of movements done wrong.
+    """Return a method's figures: mm, mm/frame², per cent; of all, of each subject, and of movements done wrong.
 
-    Of the subjects' own figures those `OUT_OF_STEP` have theirs; all others leave them out.
+    Subjects `OUT_OF_STEP` have figures of their own, and are left out of all others.
     """
     kept, subject = in_step(clips), np.array([clip.subject for clip in clips])
     wrong = np.array([clip.name.endswith("_inc") for clip in clips])
@@ -196,23 +199,23 @@ def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
 
 
 def in_step(clips: Sequence[Clip]) -> NDArray[np.bool_]:
-    """(C,) which clips are of people whose two systems agree in time: those that means are taken over."""
+    """Return which clips (C,) are of people whose two systems are synchronised; means are taken over these."""
     return np.array([clip.subject not in OUT_OF_STEP for clip in clips])
 
 
 def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:
-    """How well stated deviation and anomaly predict the error.
+    """Measure how well the predicted deviation and the anomaly indicate the error.
 
     Args:
-        error: (N, 13) metres, NaN where Vicon has nothing.
-        sigma: (N, 13) metres, stated.
+        error: (N, 13) metres, NaN where Vicon has no joint.
+        sigma: (N, 13) metres, predicted.
         anomaly: (N,) score of each frame.
         flagged: (N,) whether a frame is flagged as an anomaly.
 
     Returns:
-        the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than
-        10 cm, and for the worst tenth of the frames by mean error, of the root mean square of sigma over the joints
-        and of the anomaly (None where there is no such joint); error found by deviation stated; the share flagged.
+        the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than 10
+            cm, and for the worst tenth of the frames by mean error, of the root mean square of sigma over the joints
+            and of the anomaly (None if there is no such joint); the error-to-sigma ratio; the share flagged.
     """
     known = np.isfinite(error) & np.isfinite(sigma)
     off = error[known] > OFF

@@ -1,4 +1,5 @@
-"""What is compared on a Kinect: filters, baselines that learn, and steadypose, each for the person who is left out."""
+"""The methods compared on a Kinect, each for the person who is left out: filters, baselines that learn, and
+steadypose."""
 
 from __future__ import annotations
 
@@ -28,14 +29,15 @@ from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes.sensor_bias import train_correction
 
 RIDGE, RIDGE_PENALTY = "ridge regression", 2200.0
-"""The penalty is what a search on s07 and s08 found, the same at every delay."""
+"""Name and penalty of the ridge regression. The penalty was chosen by a search on s07 and s08, the same at every
+delay."""
 TCN = "temporal convolution"
 SMOOTHNET = "SmoothNet-style"
 UNKNOWN, KNOWN = "steadypose", "steadypose, sensor known"
 
 
 class Stated(NamedTuple):
-    """Our output for a clip, besides positions."""
+    """steadypose's output for a clip, besides positions."""
 
     sigma: Floats  # (T, 13) metres
     anomaly: Floats  # (T,)
@@ -44,13 +46,13 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """A way to clean clips, at one delay.
+    """A method to clean clips, at one delay.
 
     Attributes:
-        name: in tables.
+        name: name in tables.
         delay: frames.
-        run: clips to (T, 13, 3) metres each, and what steadypose states of them.
-        parameters: found by tuning.
+        run: maps clips to (T, 13, 3) metres each, and steadypose's further output for them.
+        parameters: tuned parameters.
     """
 
     name: str
@@ -62,9 +64,9 @@ class Method:
 def run_filter(
     clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats], whole_body: bool = False
 ) -> list[Floats]:
-    """A filter's answers for each clip, (T, 13, 3) metres. All clips go through it at once, side by side.
+    """Return a filter's estimates of each clip, (T, 13, 3) metres. All clips are processed together, side by side.
 
-    Most take the scored joints alone, in two thirds of the time; others need the ``whole_body``.
+    Most filters receive only the scored joints, in two thirds of the time; others need the ``whole_body``.
     """
     batch = side_by_side([to_canonical(KINECT22, clip.kinect)[0] if whole_body else clip.raw for clip in clips])
     answers = run(batch, np.arange(len(batch)) / FPS)
@@ -74,10 +76,10 @@ def run_filter(
 
 
 def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tuple[list[Floats], list[Stated]]:
-    """Each clip, cleaned as by ``steadypose clean --delay K``.
+    """Clean each clip as by ``steadypose clean --delay K``.
 
-    The command gives the same numbers for each clip alone, but for its last few frames, where a shorter clip ends by
-    absence and not with the stream (0.05 mm of a clip's mean, up to 4 mm in its last frame).
+    For a clip alone, the command gives the same numbers except for its last few frames. There a shorter clip ends by
+    absence, not with the stream (0.05 mm of a clip's mean, up to 4 mm in its last frame).
     """
     batch = side_by_side([clip.kinect for clip in clips])
     cleaned = product.run(settings, batch, np.arange(len(batch)) / FPS, delay, "kinect22")
@@ -92,13 +94,13 @@ def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tupl
 
 @dataclass
 class Kinect:
-    """The methods, with each person left out in turn; what does not depend on the person is computed once.
+    """The methods, with each person left out in turn. What does not depend on the person is computed once.
 
     Attributes:
-        bench: where this runs.
+        bench: settings of the study.
         data: ``ui_prmd.npz``.
-        clips: of all people.
-        taught: of all people, the clips that baselines learn from.
+        clips: clips of all people.
+        taught: clips of all people from which baselines learn.
     """
 
     bench: Bench
@@ -108,7 +110,8 @@ class Kinect:
     _answers: dict[tuple[str | float, ...], dict[str, tuple[Floats, Stated | None]]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:
-        """One parameter search for each filter and delay on the clips of all people, with figures for each subject."""
+        """Run one parameter search for each filter and delay on the clips of all people, with figures for each
+        subject."""
         groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
 
         def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
@@ -126,7 +129,7 @@ class Kinect:
         return tune(self.bench, evaluate, "Kinect", FILTERS)
 
     def methods(self, left_out: str, tuned: Mapping[tuple[str, int], Tuned]) -> Iterator[Method]:
-        """All methods, tuned and trained without this person."""
+        """Yield all methods, tuned and trained without this person."""
         densities: dict[int, float] = {}
         for (name, delay), search in tuned.items():
             baseline = next(p for p in FILTERS if p.name == name)
@@ -154,13 +157,13 @@ class Kinect:
             yield Method(KNOWN, delay, partial(run_ours, settings=known, delay=delay))
 
     def correction(self, left_out: str) -> Path:
-        """The sensor's correction, trained without this person, or found in ``runs`` from an earlier call."""
+        """Return the sensor correction trained without this person, or loaded from ``runs``."""
         steps = 40 if self.bench.quick else 4000
         folder = ROOT / "runs" / f"kinect-{digest(self.data)}-{steps}"
         name = f"correction-without-{left_out}"
         path = folder / name / f"{name}.safetensors"
         if not path.is_file():
-            self.bench.progress.stop()  # training draws a bar of its own
+            self.bench.progress.stop()  # training draws its own progress bar
             subjects = tuple(s for s in dict.fromkeys(c.subject for c in self.taught) if s != left_out)
             train_correction(TrainingOptions(self.data, folder, f"without-{left_out}", steps), subjects)
             self.bench.progress.start()
@@ -172,7 +175,8 @@ class Kinect:
         name: tuple[str | float, ...],
         run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]],
     ) -> tuple[list[Floats], list[Stated] | None]:
-        """What is the same whoever is left out: run over the clips of all people once, and kept by ``name``."""
+        """Run a method that does not depend on the person left out once over all clips, and keep its output by
+        ``name``."""
         if name not in self._answers:
             positions, stated = run(self.clips)
             every = zip(self.clips, positions, stated or [None] * len(positions), strict=True)
@@ -183,7 +187,7 @@ class Kinect:
 
 
 def best_without(left_out: str, search: Tuned, baseline: Baseline) -> dict[str, float]:
-    """Of the points that a search tried, the parameters that are best for the others."""
+    """Return the parameters that are best for the other people, among the points that a search evaluated."""
     if not search.tried:
         return search.parameters
 
@@ -205,12 +209,12 @@ class Learners:
         self._lesson = lru_cache(maxsize=1)(partial(self._smoothed, clips))
 
     def ridge(self, delay: int) -> Method:
-        """The ridge regression, fitted at once."""
+        """Fit the ridge regression."""
         answer = kinect_regression.ridge(self._lesson(delay, 0), self._truths, RIDGE_PENALTY)
         return Method(RIDGE, delay, partial(self._run, answer, delay, 0))
 
     def convolution(self, delay: int) -> Method:
-        """The temporal convolution, trained at once."""
+        """Train the temporal convolution."""
         ahead = kinect_regression.look_ahead(delay)
         lesson = self._lesson(delay, ahead)
         answer = kinect_regression.temporal_convolution(lesson, self._truths, OTHER_SIDE, ahead, self._steps, seed=0)
@@ -222,7 +226,7 @@ class Learners:
         return [answer(clip) for clip in self._smoothed(clips, delay, ahead)], None
 
     def _smoothed(self, clips: Sequence[Clip], delay: int, ahead: int) -> list[kinect_regression.Smoothed]:
-        """Clips as the regressions read them, smoothed as was found best for this delay."""
+        """Smooth clips for the regressions, with the best parameters for this delay."""
         scored = [J[name] for name in SCORED]
         return kinect_regression.smoothed([clip.kinect for clip in clips], scored, delay, ahead, self._densities[delay])
 

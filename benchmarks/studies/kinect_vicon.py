@@ -1,20 +1,20 @@
-"""Real Kinect against Vicon: what cleaning does to the noise of a real sensor (UI-PRMD), each person left out in turn.
+"""Real Kinect against Vicon: how cleaning reduces the noise of a real sensor (UI-PRMD), each person left out in turn.
 
-Protocol, the same for every method. The Kinect's 22 joints at 30 Hz go in; 13 joints are scored (head, shoulders,
-elbows, wrists, hips, knees, ankles) against the Vicon's joint centres (`prior.mocap.plug_in_gait`). Each clip is
-aligned by one rotation and one translation. Then a constant offset a joint, in the frame of the trunk that hips and
-shoulders span, is added: two systems do not mean the same point by "hip". For each of the eight people, each method's
-offset is learned on its own output on the others, and so are the parameters of baselines and the correction of "sensor
-known". At a delay of k frames a frame is estimated with k later ones known; at the end of a clip, with those there are.
+The protocol is the same for every method. The input is the Kinect's 22 joints at 30 Hz. 13 joints (head, shoulders,
+elbows, wrists, hips, knees, ankles) are scored against the Vicon's joint centres (`prior.mocap.plug_in_gait`). Each
+clip is aligned by one rotation and one translation. Then a constant offset per joint is added, in the frame of the
+trunk spanned by hips and shoulders, because the two systems define "hip" differently. For each of the eight people,
+each method's offset is learned from its own output on the others. So are the parameters of baselines and the correction
+of "sensor known". At a delay of k frames, an estimate uses k later frames, or those up to the end of the clip.
 
-Of the networks that ship, the smoother's mixture was trained on what the Kinect made of s01 to s06, beside the Vicon,
-and chosen on s07 and s08; the others have seen the Vicon's motion of s01 to s06. So "each person left out" holds for
-offsets, baselines and the correction, not for steadypose's smoother: its rows flatter it by what people it was fitted
-to are worth.
+The smoother's mixture that ships was trained on the Kinect's output for s01 to s06, with the Vicon as reference, and
+chosen on s07 and s08. The other networks have seen the Vicon's motion of s01 to s06. So "each person left out" holds
+for offsets, baselines and the correction, but not for steadypose's smoother. Its rows are too good by the advantage of
+people it was fitted to.
 
-s01's two systems are out of step: its column stands, no mean counts it. More than half of a method's error here is a
-constant that differs between persons and definitions of a joint, which none can know: the second figure of position,
-"moving", takes each joint's constant offset off each clip, for all methods alike.
+s01's two systems are not synchronised: its column is shown, but no mean includes it. More than half of a method's error
+here is a constant that differs between persons and definitions of a joint, which no method can know. The second figure
+of position, "moving", subtracts each joint's constant offset in each clip, for all methods alike.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = (*CLEAN, "training.recipes.sensor_bias")
-"""No correction that ships: each is trained here, without the person left out."""
+"""What the results depend on. No sensor correction that ships: each is trained here, without the person left out."""
 
 OFFSET_CLIPS, TUNING_CLIPS = 3, 5
-"""Offsets are learned on every n-th of the others' clips, filters tuned on every n-th."""
+"""Steps between clips: offsets are learned on every n-th of the others' clips, filters are tuned on every n-th."""
 
 
 def run(bench: Bench) -> Result:
-    """Leave one person out, tune, run, score; then all people's clips together."""
+    """Leave one person out, tune, run and score; then score all people's clips together."""
     assert bench.mocap is not None
     path = bench.mocap / "ui_prmd.npz"
     subjects = ("s01", "s05", "s08") if bench.quick else SUBJECTS
@@ -76,7 +76,7 @@ def run(bench: Bench) -> Result:
         for method in kinect.methods(person, tuned):
             result, skin, error, stated = _scored(method, asked, others)
             key = (method.name, method.delay)
-            runs[key] = runs.get(key, -1) + 1  # networks of several seeds have one name
+            runs[key] = runs.get(key, -1) + 1  # networks of several seeds share one name
             parts.setdefault((*key, runs[key]), []).append((result, {
                 "parameters": dict(method.parameters), "markers_mm": round(1e3 * float(skin.position.mean()), 3),
             }))  # fmt: skip
@@ -119,7 +119,8 @@ def run(bench: Bench) -> Result:
 def _scored(
     method: Method, asked: Sequence[Clip], others: Sequence[Clip]
 ) -> tuple[Scores, Scores, Floats, list[Stated] | None]:
-    """Scores of one person's clips against joint centres and against markers, errors (N, 13), and what was stated."""
+    """Score one person's clips against joint centres and markers; return errors (N, 13) and steadypose's
+    predictions."""
     answers, stated = method.run([*others, *asked])
     found: list[tuple[Scores, Floats]] = []
     for truth in ("centres", "markers"):
@@ -132,7 +133,7 @@ def _scored(
 
 
 def _together(scores: Sequence[Scores], people: Sequence[str]) -> Scores:
-    """Scores of several people's clips as of one list; joints as the mean over people in step."""
+    """Merge the scores of several people's clips; joints are the mean over people whose systems are synchronised."""
     return Scores(
         position=np.concatenate([s.position for s in scores]),
         moving=np.concatenate([s.moving for s in scores]),
@@ -165,8 +166,11 @@ def _record(
 def _ratios(
     mine: Scores, delay: int, clips: Sequence[Clip], scored: Mapping[tuple[str, int, int], Scores]
 ) -> dict[str, Any]:
-    """Errors by those of the best filter up to this delay (least sum of errors) and of the temporal convolution at it:
-    with their intervals over all clips in step, and position for each person."""
+    """Return ratios of errors to the best filter up to this delay (least sum of errors) and to the temporal
+    convolution.
+
+    They have intervals over all synchronised clips, and position for each person.
+    """
     kept = in_step(clips)
     names = {baseline.name for baseline in FILTERS}
     filters = {k: s for k, s in scored.items() if k[0] in names and OFFLINE < k[1] <= delay}
@@ -218,7 +222,7 @@ def _moving(records: Sequence[dict[str, Any]], delays: Sequence[int]) -> Table:
 def _by_delay(
     records: Sequence[dict[str, Any]], delays: Sequence[int], figure: str, name: str, title: str, note: str
 ) -> Table:
-    """A row a method, a column a delay."""
+    """Build a table with a row for each method and a column for each delay."""
     cells: dict[str, dict[int, str]] = {}
     for record in records:
         cell = f"{record[figure]:.1f} / {record['acceleration_mm']:.2f}"
@@ -273,7 +277,7 @@ def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: S
 
 
 def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:
-    """How well sigma and anomaly predict the error, for each person, at a delay of 4."""
+    """Build a table of how well sigma and anomaly indicate the error, for each person, at a delay of 4."""
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
         "auroc_worst": "AUROC, worst tenth of frames", "auroc_worst_anomaly": "of the anomaly",

@@ -1,9 +1,9 @@
-"""Real MediaPipe beside four cameras: one man on a standing treadmill (Pose2Sim's demo), to validate on alone.
+"""Real MediaPipe beside four cameras: one man on a standing treadmill (Pose2Sim's demo), for validation only.
 
-World landmarks of each camera go in, 60 frames a second split into two streams of 30 Hz, with their confidences' joints
-as they are. They have no place in the world: all is compared relative to the hips' middle, after one rotation a clip,
-against joints triangulated from all four cameras, good to 1 to 2 cm. What MediaPipe means by a joint the reference
-means too. One camera has a third of its frames with left and right exchanged, which is scored by itself.
+The input is world landmarks of each camera, at 60 frames a second split into two streams of 30 Hz, with MediaPipe's
+confidences. They have no position in the world, so joints are compared relative to the middle of the hips, after one
+rotation per clip. The reference is joints triangulated from all four cameras, accurate to 1 to 2 cm. It defines joints
+as MediaPipe does. One camera has a third of its frames with left and right swapped and is scored separately.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DEPENDS_ON = CLEAN
 CAMERAS = ("cam01", "cam03", "cam04", "cam02")
 EXCHANGED = "cam02"
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""MediaPipe's x right, y down, z forward, to z up."""
+"""Rotation from MediaPipe's x right, y down, z forward to z up."""
 
 
 class Stream(NamedTuple):
@@ -45,7 +45,7 @@ class Stream(NamedTuple):
 
 
 def read_streams(path: Path) -> list[Stream]:
-    """Both halves of the frames of each camera."""
+    """Read both halves of the frames of each camera."""
     streams = []
     with np.load(path) as data:
         reference = np.where(data["reference/valid"][..., None], data["reference/positions"], np.nan)
@@ -57,9 +57,10 @@ def read_streams(path: Path) -> list[Stream]:
 
 
 def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
-    """Errors of (T, 22, 3), mm and mm/frame², relative to the hips' middle and turned as a whole onto the truth.
+    """Return errors of (T, 22, 3), mm and mm/frame², relative to the middle of the hips and rotated as a whole onto the
+    truth.
 
-    The constant offset of each joint, which is partly a matter of its definition, is subtracted.
+    The constant offset of each joint, which partly depends on its definition, is subtracted.
     """
     both = np.isfinite(answer).all(axis=-1).any(axis=0) & np.isfinite(stream.truth).all(axis=-1).any(axis=0)
     own, wanted = ((x - x[:, HIPS].mean(axis=1, keepdims=True))[:, both] for x in (answer, stream.truth))
@@ -73,7 +74,7 @@ def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
 
 
 def run(bench: Bench) -> Result:
-    """Every method on every stream, filters tuned on these very ones."""
+    """Run every method on every stream, with filters tuned on the same streams."""
     assert bench.mocap is not None
     streams = read_streams(bench.mocap / "mediapipe_pose.npz")
     seen = side_by_side([stream.seen for stream in streams])
@@ -104,7 +105,7 @@ def run(bench: Bench) -> Result:
 
 
 def _records(answer: Answer, streams: Sequence[Stream]) -> list[dict[str, Any]]:
-    """A record for the cameras that exchange nothing, and for the one that does."""
+    """Return a record for the cameras that swap nothing, and for the one that does."""
     found: dict[str, list[dict[str, float]]] = {"three cameras": [], EXCHANGED: []}
     for number, stream in enumerate(streams):
         name = EXCHANGED if stream.camera == EXCHANGED else "three cameras"

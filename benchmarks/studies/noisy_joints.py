@@ -1,8 +1,8 @@
-"""Noisy joints: HuMoR's protocol (90 frames, 4 cm), swept over levels, and noise of the kinds that sensors make.
+"""Noisy joints: HuMoR's protocol (90 frames, 4 cm) at several levels, and noise like that of real sensors.
 
-HuMoR adds independent noise to every joint (Rempe et al. 2021, section 5.2). Independent noise flatters low-pass
-filters: the other conditions have correlated noise, spikes, and exchanged limbs. FLK, a Kalman filter of learned motion
-(Martini et al. 2024), is a baseline here alone: it was made for such noise, and has no delay.
+HuMoR adds independent noise to every joint (Rempe et al. 2021, section 5.2). Independent noise favours low-pass
+filters, so the other conditions have correlated noise, spikes, and swapped limbs. FLK, a Kalman filter with learned
+motion (Martini et al. 2024), is a baseline in this study only: it was made for such noise, and has no delay.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ CONDITIONS: dict[str, Condition] = {
     "1 cm, swaps": _with_swaps,
     "lasting 2 cm, spikes, swaps": _with_all,
 }
-"""Standard deviation along an axis; "lasting": correlation 0.9 from a frame to the next."""
+"""Conditions by standard deviation along an axis; "lasting": correlation 0.9 between frames."""
 
 
 def run(bench: Bench) -> Result:
-    """Every method in every condition."""
+    """Run every method in every condition."""
     clips = bench.clips()
     kept = ("4 cm", "lasting 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
     track = partial(bench.progress.track, description="FLK")

@@ -1,4 +1,5 @@
-"""What the fusion is worth: motion whose truth is known, seen with noise, its root hidden for two seconds at a time."""
+"""Accuracy of the fusion of the root: noisy observations of known motion, with the root hidden for two seconds at a
+time."""
 
 from __future__ import annotations
 
@@ -19,20 +20,20 @@ from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
 SEEN_FRAMES, HIDDEN_FRAMES = 36, 60
-"""Frames for which the root is seen, and then hidden, in turn."""
+"""Number of frames in which the root is observed, then hidden, in turn."""
 
 ROOT_NOISE, JOINT_NOISE = 0.015, 0.01
-"""Metres, standard deviations of the root's error and of that of the joints against it."""
+"""Standard deviations of the root's error, and of the joints' errors relative to it, metres."""
 
 MEMORY = 0.95
-"""Correlation of these errors from one frame to the next."""
+"""Correlation of these errors between frames."""
 
 HORIZONS = (15, 30, 60)
-"""Frames after which the root hidden is compared with the truth."""
+"""Frames after which the hidden root is compared with the truth."""
 
 
 class Way(NamedTuple):
-    """What a method answers, in the world.
+    """Output of a method, in the world.
 
     Attributes:
         positions: (T, 22, 3) metres.
@@ -46,11 +47,11 @@ class Way(NamedTuple):
 
 
 Method = Callable[[Sequence[PoseClean]], Way]
-"""From a clip as `observe` gives it; each frame is answered by what came until then."""
+"""Maps a clip from `observe` to estimates; each frame's uses only what came until then."""
 
 
 def fusion(settings: TrajectorySettings, messages: Sequence[PoseClean]) -> Way:
-    """What ships, with these settings."""
+    """Run the trajectory that ships, with these settings."""
     pipeline = TrajectoryPipeline(settings)
     bodies = [pipeline.process(message)[0].bodies[0] for message in messages]
     return Way(
@@ -65,7 +66,7 @@ METHODS: Mapping[str, Method] = {
     "network": partial(fusion, TrajectorySettings(contacts=False)),
     "network and contacts": partial(fusion, TrajectorySettings()),
 }
-"""The ways of going on without a root: a Kalman filter alone, with the network's velocity, and with standing feet."""
+"""Methods to continue without a root: a Kalman filter alone, with the network's velocity, and with standing feet."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Clip:
 
     @property
     def hidden(self) -> NDArray[np.bool_]:
-        """(T,) where `observe` hides the root."""
+        """Frames (T,) in which `observe` hides the root."""
         return np.arange(len(self.positions)) % (SEEN_FRAMES + HIDDEN_FRAMES) >= SEEN_FRAMES
 
 
@@ -96,10 +97,10 @@ def _lasting_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
 
 
 def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
-    """A clip as a prior's output: with noise, and without the trunk where `Clip.hidden`.
+    """Return a clip as a prior's output: with noise, and without the trunk where `Clip.hidden`.
 
-    There the root stays where it was last seen, with an infinite standard deviation, and the rest of the body with
-    it: only the body's own motion is known, which is the task of HM-VAE's section 3.3.
+    There the root stays where it was last observed, with an infinite standard deviation, and the body with it. Only the
+    body's own motion is known, which is the task of HM-VAE's section 3.3.
     """
     count = len(clip.positions)
     root = clip.positions[:, 0] + ROOT_NOISE * _lasting_noise((count, 3), rng)
@@ -125,7 +126,7 @@ def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
 
 @dataclass
 class Errors:
-    """What one method did, collected over clips; lists hold one number a frame or a span."""
+    """Errors of one method over clips; lists hold one number per frame or span."""
 
     seen_position: list[float] = field(default_factory=list)
     seen_velocity: list[float] = field(default_factory=list)
@@ -158,7 +159,7 @@ class Errors:
             self.hidden_path.append(float(np.linalg.norm(np.diff(truth[start : end + 1, :2], axis=0), axis=1).sum()))
 
     def summary(self) -> dict[str, float]:
-        """Means and root mean squares, in the units that the keys name."""
+        """Return means and root mean squares, in the units named by the keys."""
         last, path = np.array(self.hidden_position[HORIZONS[-1]]), np.array(self.hidden_path)
         walked = path > 1.0
         return {
@@ -182,7 +183,7 @@ def _rms(values: list[float]) -> float:
 
 
 def evaluate_fusion(clips: list[Clip], methods: Mapping[str, Method], seed: int = 0) -> dict[str, Errors]:
-    """Run every method over every clip; "as observed" is what goes in, its velocity the difference of frames."""
+    """Run every method over every clip; "as observed" is the input, with velocity from differences of frames."""
     errors = {name: Errors() for name in ("as observed", *methods)}
     for number, clip in enumerate(clips):
         messages = observe(clip, np.random.default_rng((seed, number)))

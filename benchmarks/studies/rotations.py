@@ -1,13 +1,15 @@
-"""How joints are turned: orientations on motion whose files have rotations, and the heading from a real Kinect.
+"""Orientations of joints on motion whose files have rotations, and the heading from a real Kinect.
 
-Joints of people that nothing was trained on (CMU's 02, DanceDB, LAFAN1; `rotations_truth`) go in with noise; global
-orientations of the 17 joints that carry another are compared. A file's joint at rest is not turned as the canonical
-one: "file" is against the file's orientations after one constant rotation a clip and joint, fitted to the method's own
-answer to the joints without noise (`rotations_scoring.align`). It has the difference of definitions in it, which the
-rows without noise show. "Noise alone" is against that answer itself. The first two seconds of a clip are not scored.
+The input is joints, with noise, of people on whom nothing was trained (CMU's 02, DanceDB, LAFAN1; `rotations_truth`).
+Global orientations of the 17 joints that carry another are compared. A file's joint at rest has another orientation
+than the canonical one. So the columns "file" compare with the file's orientations after one constant rotation per clip
+and joint, fitted to the method's own output for the joints without noise (`rotations_truth.align`). They include the
+difference of definitions, which the rows without noise show. "Noise alone" compares with that output itself. The first
+two seconds of a clip are not scored.
 
-A root is a pelvis. A trunk's frame is steadier, and another thing: against the Vicon's hips its heading is that of the
-pelvis, against the mean of hips and shoulders the trunk's, which `hips and shoulders` measures by definition."""
+The root is the pelvis. A trunk's frame is steadier, but something else: the heading against the Vicon's hips is that of
+the pelvis, against the mean of hips and shoulders that of the trunk, which `hips and shoulders` measures by definition.
+"""
 
 from __future__ import annotations
 
@@ -58,14 +60,15 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
 
 RIDGE, NOISE = 1e-3, 0.02
-"""Of standardised features, a frame; and metres along an axis, of the noise that the ridge regression is fitted in."""
+"""Ridge penalty of standardised features, per frame; and noise along an axis in which the ridge regression is fitted,
+metres."""
 
 Baseline = Callable[[Floats], Floats]
-"""From joints (N, 22, 3) metres to root orientations (N, 3, 3), but for a constant rotation."""
+"""Maps joints (N, 22, 3) metres to root orientations (N, 3, 3), up to a constant rotation."""
 
 
 def kabsch(positions: Floats) -> Floats:
-    """(N, 3, 3) the rotation of the rest pose's trunk that lies nearest to the trunk's joints (Kabsch 1976)."""
+    """Return the rotation (N, 3, 3) that brings the rest pose's trunk nearest to the trunk's joints (Kabsch 1976)."""
     trunk = list(TRUNK)
     seen, rest = positions[:, trunk], REST_POSITIONS[trunk]
     across = np.einsum("nja,jb->nab", seen - seen.mean(axis=1, keepdims=True), rest - rest.mean(axis=0))
@@ -75,7 +78,7 @@ def kabsch(positions: Floats) -> Floats:
 
 
 def ridge(clips: MotionClips, seed: int) -> Baseline:
-    """`kabsch`, corrected by a ridge regression on all joints in its frame, fitted to these clips in noise."""
+    """Correct `kabsch` by a ridge regression on all joints in its frame, fitted to these clips with noise."""
     truth = clips.positions.reshape(-1, 22, 3)
     noisy = gaussian(truth, NOISE, np.random.default_rng(seed))
     turned = kabsch(noisy)
@@ -94,12 +97,12 @@ def ridge(clips: MotionClips, seed: int) -> Baseline:
 
 
 def _features(positions: Floats, turned: Floats) -> Floats:
-    """(N, 66) joints about the trunk's middle, in its frame."""
+    """Return the joints (N, 66) about the trunk's middle, in its frame."""
     return ((positions - positions[:, list(TRUNK)].mean(axis=1, keepdims=True)) @ turned).reshape(len(positions), -1)
 
 
 def baselines(clips: MotionClips, seed: int) -> Mapping[str, Baseline]:
-    """By name; ``clips`` of training people."""
+    """Return the baselines by name; ``clips`` are of training people."""
     return {
         "hips and shoulders": trunk_frame,
         "trunk, Kabsch": kabsch,
@@ -111,7 +114,7 @@ STREAMS = ROOT / "sim_data"
 
 
 def root_errors(methods: Mapping[str, PriorSettings]) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Degrees, median and 95th percentile, of root, heading and tilt, by stream and method."""
+    """Return errors of root, heading and tilt by stream and method: median and 95th percentile, degrees."""
     return {
         path.parent.name: {name: _errors(path.parent, settings) for name, settings in methods.items()}
         for path in sorted(STREAMS.glob("*/metadata.yaml"))
@@ -147,7 +150,7 @@ DEPENDS_ON = VARIANTS
 
 DELAY = PriorSettings().delay
 LASTING_S = 0.5
-"""Seconds in which the correlation of noise that lasts falls to 1 / e."""
+"""Correlation time of time-correlated noise (to 1 / e), seconds."""
 PERFECT, AIMED, STEADYPOSE = "none", "aimed bones", "steadypose"
 METHODS: Mapping[str, PriorSettings] = {
     AIMED: PriorSettings(orient=OrientSettings(enabled=False)),
@@ -157,18 +160,18 @@ METHODS: Mapping[str, PriorSettings] = {
 
 
 _PARTS = {"pelvis": ("hip",), "trunk": ("hip", "shoulder")}
-"""Whose heading the Kinect's is compared with."""
+"""Parts whose heading the Kinect's is compared with."""
 
 
 class _Turned(NamedTuple):
-    """Of one method: orientations (T, C, 17, 3, 3), and the root's covariance (T, C, 3, 3) rad²."""
+    """Output of one method: orientations (T, C, 17, 3, 3), and the root's covariance (T, C, 3, 3) rad²."""
 
     orientations: Floats
     covariance: Floats
 
 
 def run(bench: Bench) -> Result:
-    """Every method in every condition; then the real Kinect."""
+    """Run every method in every condition; then the real Kinect."""
     assert bench.mocap is not None
     clips = read(bench.mocap, bench.split, 4 if bench.quick else 8)
     rng, scored = np.random.default_rng(bench.seeds[0]), slice(SKIPPED, None)
@@ -212,7 +215,7 @@ def _rounded(found: Interval) -> list[float]:
 
 
 def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
-    """Of all methods, to joints (T, C, 22, 3)."""
+    """Run all methods on joints (T, C, 22, 3)."""
     found: dict[str, _Turned] = {}
     joints = seen
     for name, settings in METHODS.items():
@@ -222,7 +225,7 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
             turned, _covariance(cleaned, turned) if name == STEADYPOSE else np.full((*turned.shape[:2], 3, 3), np.nan)
         )
         joints = cleaned.positions if name == STEADYPOSE else joints
-    for name, root in roots.items():  # of the root alone, from the joints that steadypose publishes
+    for name, root in roots.items():  # of the root only, from the joints that steadypose publishes
         turned = found[AIMED].orientations.copy()
         turned[:, :, 0] = root(joints.reshape(-1, 22, 3)).reshape(turned[:, :, 0].shape)
         found[name] = _Turned(turned, np.full((*turned.shape[:2], 3, 3), np.nan))
@@ -230,7 +233,7 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
 
 
 def _covariance(cleaned: product.Cleaned, turned: Floats) -> Floats:
-    """(T, C, 3, 3) of the roots of orientations (T, C, 17, 3, 3)."""
+    """Return the covariance (T, C, 3, 3) of the roots of orientations (T, C, 17, 3, 3)."""
     parts = cleaned.positions.reshape(-1, 22, 3), cleaned.sigma.reshape(-1, 22), turned[:, :, 0].reshape(-1, 3, 3)
     return RootCovariance()(*parts).reshape(turned[:, :, 0].shape)
 
@@ -240,7 +243,7 @@ def _matrices(quaternions: Floats) -> Floats:
 
 
 def _ratio(found: _Turned, truth: Floats, scored: slice) -> float:
-    """Mean squared error of the root over the variance stated, an axis: 1 where it is honest."""
+    """Return the mean squared error of the root over the predicted variance, along an axis; 1 when calibrated."""
     apart = (truth[scored, :, 0] @ found.orientations[scored, :, 0].swapaxes(-1, -2)).reshape(-1, 3, 3)
     error, covariance = Rotation.from_matrix(apart).as_rotvec(), found.covariance[scored].reshape(-1, 3, 3)
     known = np.isfinite(covariance).all(axis=(1, 2))
@@ -251,8 +254,10 @@ def _ratio(found: _Turned, truth: Floats, scored: slice) -> float:
 
 
 def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, dict[str, list[float]]]:
-    """Degrees, median and 95th percentile, by which the heading is off that of Vicon's `_PARTS`, each clip's median
-    removed: two systems do not mean the same point by "hip"."""
+    """Return heading errors against Vicon's `_PARTS`: median and 95th percentile, degrees.
+
+    Each clip's median is subtracted, because the two systems define "hip" differently.
+    """
     assert bench.mocap is not None
     pairs = [pair for subject in VALIDATION_SUBJECTS for pair in
              load_pairs(bench.mocap / "ui_prmd.npz", (subject,))[:: 40 if bench.quick else 6]]  # fmt: skip
@@ -272,7 +277,8 @@ def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, dict[str, 
 
 
 def _heading(vicon: Floats, parts: Sequence[str]) -> Floats:
-    """(T,) radians, the mean direction of these parts of joints (T, 22, 3), from right to left, turned to forward."""
+    """Return the heading (T,) of joints (T, 22, 3), radians: the mean direction of these parts from right to left,
+    turned forward."""
     left = np.sum([vicon[:, J[f"left_{part}"]] - vicon[:, J[f"right_{part}"]] for part in parts], axis=0)
     return np.arctan2(-left[:, 0], left[:, 1])
 
@@ -286,7 +292,7 @@ def _pair(values: list[float]) -> str:
 
 
 def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
-    """A row a condition and method."""
+    """Build a table with a row for each condition and method."""
     rows = []
     for record in records:
         alone, against = record["noise alone"], record["file"]
@@ -317,7 +323,7 @@ def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
 
 
 def _bends(records: list[dict[str, Any]]) -> Table:
-    """Twist by how straight a limb is, and all joints by speed."""
+    """Build a table of twist by how straight a limb is, and of all joints by speed."""
     kept = [record for record in records if record["method"] in METHODS]
     rows = [
         [

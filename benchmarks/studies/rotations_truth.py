@@ -1,5 +1,5 @@
 """Motion whose files have rotations, as 30 Hz clips, and errors of orientations: of all joints, of the root's heading
-and tilt, along and about bones, from frame to frame."""
+and tilt, along and about bones, and between frames."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from steadypose.training.data.prepare import find_faults, resample
 from steadypose.training.data.readers import bvh_motion, members
 
 FRAMES, SKIPPED = 240, 60
-"""Frames of a clip, and how many of them, at its start, are not scored: a filter is not judged by how it begins."""
+"""Length of a clip, and number of frames at its start that are not scored, so that a filter's start does not count."""
 
 
 class _Source(NamedTuple):
-    """Where recordings with rotations are.
+    """Location of recordings with rotations.
 
     Attributes:
-        name: of the source.
+        name: name of the source.
         archive: its file.
-        turns: the joint of the file that turns with each canonical joint, of left and middle.
-        people: of each split, the marks in a file's name by which its people are known.
+        turns: the file's joint that rotates with each canonical joint, left and middle.
+        people: marks in file names that identify the people of each split.
     """
 
     name: str
@@ -71,10 +71,10 @@ SOURCES = (
         {"val": ("subject1",), "test": ("subject2", "subject3", "subject4")},
     ),
 )  # fmt: skip
-"""CMU's subject 02 trains nothing; DanceDB and LAFAN1 choose and measure only."""
+"""Sources. Nothing is trained on CMU's subject 02; DanceDB and LAFAN1 are only for choosing and measuring."""
 
 SCORED = tuple(J[name] for name in JOINTS if not name.endswith(("foot", "wrist", "head")))
-"""The 17 joints that carry another: the turn of hands, toes and head shows in no canonical joint."""
+"""The 17 joints that carry another. The rotation of hands, toes and head does not affect any canonical joint."""
 
 
 class Clips(NamedTuple):
@@ -94,7 +94,7 @@ class Clips(NamedTuple):
 
 
 def read(mocap: Path, split: str, most: int) -> Clips:
-    """At most ``most`` clips of `FRAMES` frames of each source, spread evenly over its recordings."""
+    """Read at most ``most`` clips of `FRAMES` frames of each source, spread evenly over its recordings."""
     found = [(source.name, *clip) for source in SOURCES for clip in _spread(list(_clips(mocap, source, split)), most)]
     names, people, positions, orientations = zip(*found, strict=True)
     return Clips(np.stack(positions, axis=1), np.stack(orientations, axis=1), np.array(names), np.array(people))
@@ -106,7 +106,7 @@ def _spread(clips: list[tuple[str, Floats, Floats]], most: int) -> list[tuple[st
 
 
 def _clips(mocap: Path, source: _Source, split: str) -> Iterator[tuple[str, Floats, Floats]]:
-    """Every clip of a source's people of this split that has no fault: who, positions and orientations."""
+    """Yield every clip without faults of a source's people of this split: person, positions and orientations."""
     if not (marks := source.people[split]):
         return
     for name, content in sorted(members(mocap / source.archive, (".bvh",), lambda _: None)):
@@ -125,7 +125,7 @@ def _clips(mocap: Path, source: _Source, split: str) -> Iterator[tuple[str, Floa
 
 
 def _orientations(bvh: Bvh, turns: Mapping[str, str]) -> Floats:
-    """(T, 17, 3, 3) of `SCORED`, z up."""
+    """Return the orientations of `SCORED`, z up, (T, 17, 3, 3)."""
     local, column = np.broadcast_to(np.eye(3), (len(bvh.values), len(bvh.joints), 3, 3)).copy(), 0
     for joint, channels in enumerate(bvh.channels):
         turning = [column + i for i, channel in enumerate(channels) if channel.endswith("rotation")]
@@ -138,7 +138,8 @@ def _orientations(bvh: Bvh, turns: Mapping[str, str]) -> Floats:
 
 
 def _turner(joint: str, turns: Mapping[str, str]) -> str:
-    """The file's joint that turns with a canonical one; the right side's has the left's name with the side changed."""
+    """Return the file's joint that rotates with a canonical one. The right side's name is the left's with the side
+    changed."""
     if not joint.startswith("right"):
         return turns[joint]
     name = turns[joint.replace("right", "left")]
@@ -148,7 +149,7 @@ def _turner(joint: str, turns: Mapping[str, str]) -> str:
 
 
 def _at_rate(orientations: Floats, fps: float, frames: int) -> Floats:
-    """(T', J, 3, 3) of (T, J, 3, 3), at 30 Hz, by slerp."""
+    """Resample (T, J, 3, 3) to 30 Hz by slerp, (T', J, 3, 3)."""
     if abs(fps - FPS) < 1e-3:
         return orientations[:frames]
     asked, own = np.arange(frames) / FPS, np.arange(len(orientations)) / fps
@@ -159,14 +160,14 @@ def _at_rate(orientations: Floats, fps: float, frames: int) -> Floats:
 
 _BALLS = [SCORED.index(J[name]) for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")]
 STRAIGHT, BENT = np.radians((10.0, 30.0))
-"""Bend of knee or elbow below which a limb is straight, and above which it is bent."""
+"""Bend of knee or elbow below which a limb is straight, and above which it is bent, radians."""
 SLOW, FAST = 0.5, 1.5
-"""m/s of the joint at the bone's end."""
+"""Speeds of the joint at the bone's end below which it is slow, and above which it is fast, m/s."""
 _ROUNDS, _NEAR = 8, np.radians(2.0)
 
 
 def child_of(joint: int) -> int:
-    """The joint at the end of the bone that a joint turns: of pelvis and chest the one above."""
+    """Return the joint at the end of the bone that a joint rotates: for pelvis and chest, the one above."""
     return {J["pelvis"]: J["spine1"], J["spine3"]: J["neck"]}.get(joint, CHILDREN[joint][0])
 
 
@@ -174,16 +175,16 @@ _BONE = np.array([REST_OFFSETS[child_of(j)] / np.linalg.norm(REST_OFFSETS[child_
 
 
 def align(truth: Floats, perfect: Floats) -> Floats:
-    """The file's orientations in a method's own convention: ``truth @ A``.
+    """Return the file's orientations in a method's own convention: ``truth @ A``.
 
-    A file's joint at rest is not turned as the canonical one, nor as any method's. A (C, 17, 3, 3), one constant
-    rotation a clip and joint, is the median of ``truth.T @ perfect`` over the clip (Weiszfeld's rounds on chordal
-    means), ``perfect`` being that method's answer to the joints without any noise. What then differs on a perfect input
-    is definition: a pelvis drawn through hips and spine bends with the spine, and a straight limb shows no twist.
+    A file's joint at rest has another orientation than the canonical one and than any method's. A (C, 17, 3, 3), one
+    constant rotation per clip and joint, is the median of ``truth.T @ perfect`` over the clip (Weiszfeld's rounds on
+    chordal means). ``perfect`` is the method's output for the joints without noise. What then differs on a noise-free
+    input is definition: a pelvis computed from hips and spine bends with the spine, and a straight limb shows no twist.
 
     Args:
-        truth: (T, C, 17, 3, 3) the file's.
-        perfect: (T, C, 17, 3, 3) the method's.
+        truth: (T, C, 17, 3, 3) of the file.
+        perfect: (T, C, 17, 3, 3) of the method.
 
     Returns:
         (T, C, 17, 3, 3).
@@ -199,17 +200,17 @@ def align(truth: Floats, perfect: Floats) -> Floats:
 
 
 def angle(rotation: Floats) -> Floats:
-    """(...) radians of rotations (..., 3, 3), exact for small ones too."""
+    """Return the angle (...) of rotations (..., 3, 3), radians, accurate for small ones too."""
     skew = rotation - rotation.swapaxes(-1, -2)
     sine = 0.5 * np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
     return np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0))
 
 
 def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
-    """Degrees; of errors the median and the 95th percentile.
+    """Return errors in degrees: the median and the 95th percentile.
 
     Args:
-        found: (T, C, 17, 3, 3) orientations.
+        found: (T, C, 17, 3, 3) estimated orientations.
         truth: (T, C, 17, 3, 3) aligned.
         positions: (T, C, 22, 3) metres, true.
     """
@@ -245,7 +246,7 @@ def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
 
 
 def spread(radians: Floats) -> list[float]:
-    """Median and 95th percentile, degrees, of what is finite."""
+    """Return the median and 95th percentile of the finite values, degrees."""
     finite = radians[np.isfinite(radians)]
     if not len(finite):
         return [float("nan")] * 2
@@ -253,35 +254,35 @@ def spread(radians: Floats) -> list[float]:
 
 
 def _excess(found: Floats, truth: Floats) -> float:
-    """Degrees a frame that orientations turn beyond the true turn, in the mean."""
+    """Return the mean excess of the estimated over the true rotation between frames, degrees a frame."""
     mine, real = (angle(r[:-1].swapaxes(-1, -2) @ r[1:]) for r in (found, truth))
     return round(float(np.degrees(np.nanmean(mine - real))), 3)
 
 
 def tilt_between(found: Floats, truth: Floats) -> Floats:
-    """(...) radians by which two orientations (..., 3, 3) lean differently, whatever their headings."""
+    """Return the difference in tilt (...) of two orientations (..., 3, 3), radians, whatever their headings."""
     return np.arccos(np.clip((found[..., 2, :] * truth[..., 2, :]).sum(axis=-1), -1.0, 1.0))
 
 
 def wrapped(angles: Floats) -> Floats:
-    """The same angles, radians, between -pi and pi."""
+    """Wrap angles to -pi to pi, radians."""
     return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 def _swing_twist(error: Floats) -> tuple[Floats, Floats]:
-    """Radians by which a bone's direction is off, and by which it is turned about itself, of (T, C, 17, 3, 3)."""
+    """Return the errors of a bone's direction and of its rotation about itself, radians, from (T, C, 17, 3, 3)."""
     bone = np.broadcast_to(_BONE, error.shape[:-1])
     moved = np.einsum("...ab,...b->...a", error, bone)
     swing = np.arctan2(np.linalg.norm(np.cross(bone, moved), axis=-1), (bone * moved).sum(axis=-1))
     skew = np.stack([error[..., 2, 1] - error[..., 1, 2], error[..., 0, 2] - error[..., 2, 0],
                      error[..., 1, 0] - error[..., 0, 1]], axis=-1)  # fmt: skip
-    # of a quaternion, vector part by scalar part: skew / (1 + trace)
+    # the quaternion's vector part over its scalar part: skew / (1 + trace)
     about = (skew * bone).sum(axis=-1)
     return swing, np.abs(2.0 * np.arctan2(about, 1.0 + np.trace(error, axis1=-2, axis2=-1)))
 
 
 def _bend(positions: Floats) -> Floats:
-    """(T, C, 4) radians by which knees and elbows are bent."""
+    """Return the bend (T, C, 4) of knees and elbows, radians."""
     chains = [(J[f"{side}_{a}"], J[f"{side}_{b}"], J[f"{side}_{c}"])
               for a, b, c in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))
               for side in ("left", "right")]  # fmt: skip

@@ -1,8 +1,8 @@
-"""The body in the world: root error and foot skating, and drift of a root that is hidden.
+"""The body in the world: root error and foot skate, and drift of a hidden root.
 
-First: in correlated noise (2 cm), with a known floor, the error of the root, and the skating of each foot by itself (a
-measure that requires both to be still, as RoHM's, ignores walking). Second: with the trunk hidden for two seconds at a
-time, the drift of the root per 10 m of path (`benchmarks.studies.root_drift`).
+First: in correlated noise (2 cm), with a known floor, the error of the root, and the skate of each foot separately. A
+measure that requires both feet to be still, such as RoHM's, ignores walking. Second: with the trunk hidden for two
+seconds at a time, the drift of the root per 10 m of path (`benchmarks.studies.root_drift`).
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from steadypose.prior.world.settings import TrajectorySettings
 DEPENDS_ON = (*VARIANTS, *WORLD)
 
 NOISE = 0.02
-"""Metres, with a correlation of 0.9 from a frame to the next."""
+"""Standard deviation of the noise, metres, with a correlation of 0.9 between frames."""
 DELAY = 4
 SKATING = 0.10
-"""m/s: a foot in contact that is faster skates."""
+"""Speed above which a foot in contact skates, m/s."""
 UNDER = 0.02
-"""Metres: a sole that is further under the floor penetrates it."""
+"""Depth under the floor beyond which a sole penetrates it, metres."""
 SPEEDS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, np.inf)
-"""m/s, of the root."""
+"""Edges of the bins of the root's speed, m/s."""
 FRAMES = 192
-"""Of a clip: two times 36 seen and 60 hidden."""
+"""Length of a clip, frames: two times 36 observed and 60 hidden."""
 
 
 def run(bench: Bench) -> Result:
-    """The whole chain beside filters, then the fusion without a root."""
+    """Measure the whole pipeline beside filters, then the fusion without a root."""
     clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
     some = clips.every(3)
     tuning_observed = correlated(some.positions, NOISE, np.random.default_rng(1))
@@ -116,11 +116,11 @@ def run(bench: Bench) -> Result:
 
 @dataclass(frozen=True)
 class Roots:
-    """The roots of `pose/world`, in the world; NaN where there is none.
+    """The roots of `pose/world`, in the world; NaN without an estimate.
 
     Attributes:
         positions, velocities: (T, C, 3) metres and m/s.
-        spreads: (T, C, 6) the standard deviations stated of both.
+        spreads: (T, C, 6) predicted standard deviations of both.
     """
 
     positions: Floats
@@ -131,7 +131,8 @@ class Roots:
 def chain(
     settings: product.PriorSettings, seen: Floats, stamps_s: Floats, world_settings: TrajectorySettings | None = None
 ) -> tuple[Floats, Floats, Roots]:
-    """Clips (T, C, 22, 3) through prior and trajectory, calibrated: pose/clean and pose/world, (T, C, 22, 3)."""
+    """Run clips (T, C, 22, 3), calibrated, through prior and trajectory; return pose/clean and pose/world, (T, C, 22,
+    3)."""
     count = seen.shape[1]
     prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=product.SLOTS_A_CLIP * count))
     trajectory = TrajectoryPipeline(world_settings or TrajectorySettings(weights=settings.refine.weights))
@@ -149,7 +150,7 @@ def chain(
 
 
 def root_by_speed(clips: MotionClips, roots: Roots) -> dict[str, dict[str, float]]:
-    """Errors of root and velocity by the root's true speed: RMS along an axis, and as found by deviation stated."""
+    """Return errors of root and velocity by the root's true speed: RMS along an axis, and the error-to-sigma ratio."""
     true_velocities = np.gradient(clips.positions[:, :, 0], 1 / FPS, axis=0)
     speed = np.linalg.norm(true_velocities, axis=-1)
     off, drifts = roots.positions - clips.positions[:, :, 0], roots.velocities - true_velocities
@@ -177,13 +178,15 @@ def _honest(error: Floats, spread: Floats) -> float:
 
 
 def _per_clip(clips: MotionClips, answer: Floats) -> Floats:
-    """(C,) metres, the mean error of joints."""
+    """Return the mean error of joints in each clip, (C,) metres."""
     return np.nanmean(position_error(answer, clips.positions), axis=(0, 2))
 
 
 def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
-    """Place and pose in the world (mm), and the feet: mean speed in contact (m/s), share of frames that skate, and of
-    those in which a sole is under the floor (%)."""
+    """Return the errors of position and pose in the world (mm), and of the feet.
+
+    For the feet: mean speed in contact (m/s), share of frames that skate, and share with a sole under the floor (%).
+    """
     found = figures(score(answer, clips.positions, missing(clips.positions), align=False), clips.person)
     root = position_error(answer[:, :, 0], clips.positions[:, :, 0])
     result = {key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm")}
@@ -207,7 +210,7 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
 
 
 def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, float]]) -> Table:
-    """What ships beside the best filter: of at most `DELAY`, by position."""
+    """Build a table of what ships beside the best filter by position, of at most `DELAY`."""
     filters = [r for r in records if r["method"] in {baseline.name for baseline in FILTERS} and r["delay"] <= DELAY]
     best = min(filters, key=lambda r: r["position_mm"])
     by_method = {r["method"]: r for r in records}
