@@ -1,5 +1,6 @@
-"""The training of every model: a recipe gives a network and its loss, which the loop minimises, resumably, with a
-progress bar, curves drawn as it goes, and a card beside the weights.
+"""The training loop of all models. A recipe gives a network and its loss, and the loop minimises the loss.
+
+Training is resumable, shows a progress bar, draws curves as it runs, and writes a card beside the weights.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ Network = TypeVar("Network", bound=nn.Module)
 Rng = np.random.Generator
 
 Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
-"""The loss of a random batch, and terms to plot; called with the number of samples, the progress of the training in
-[0, 1), and a random generator, which differs between torchrun's processes."""
+"""Type of a loss function: returns the loss of a random batch, and terms to plot. It is called with the number of
+samples, the progress of the training in [0, 1), and a random generator, which differs between torchrun's processes."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,12 @@ class TrainingOptions:
     """Options of ``steadypose train``, common to all models.
 
     Attributes:
-        data: ``prepared.npz``, or what a model is trained on instead.
-        runs: folder of training runs; a killed run of the same name resumes there.
+        data: ``prepared.npz``, or other training data of the model.
+        runs: folder of training runs; an interrupted run of the same name resumes there.
         weights: the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name.
-        iterations: optimiser steps, at least 1; None for the model's default.
-        seed: of initial weights and of sampling.
-        start: weights to start from: a set or a path.
+        iterations: number of optimiser steps, at least 1; None for the model's default.
+        seed: random seed of initial weights and of sampling.
+        start: weights to start from: a weight set or a path.
     """
 
     data: Path
@@ -58,37 +59,40 @@ class TrainingOptions:
             raise ValueError(f"iterations: expected 1 or more, got {self.iterations}")
 
     def path(self, model: str) -> Path:
-        """Where the weights of ``model`` go, in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""
+        """Return the path of a model's weights in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""
         name = f"{model}-{self.weights}"
         return self.runs / name / f"{name}.safetensors"
 
     def motion(self, *, flat: bool = False) -> tuple[MotionSet, MotionSet]:
-        """Prepared motion to train and to validate on; ``flat``: as of `MotionSet.load`."""
+        """Load prepared motion for training and for validation; ``flat`` as in `MotionSet.load`."""
         train, val = (MotionSet.load(self.data, self.weights, split, flat=flat) for split in ("train", "val"))
         return train, val
 
 
 @dataclass(frozen=True)
 class Recipe(Generic[Network]):
-    """What is a model's own in its training.
+    """The model-specific part of a training.
 
     Attributes:
-        model: its name.
-        network: makes it, untrained.
-        loss: of a random batch, and terms to plot; called with the network in training mode, the number of samples, the
-            progress of the training in [0, 1), and a random generator, which differs between torchrun's processes.
-        evaluate: quantities to plot beside these, on validation data; called in evaluation mode, without gradients.
-        iterations: optimiser steps, unless the user asks for another number.
-        batch: samples a step, of all processes together.
-        rate: of the optimiser at the start.
-        sample: what a sample is, in the plural.
-        decay: of the weights.
-        optimiser: AdamW, but for Adam as a paper has it.
-        schedule: of the rate, of the optimiser and the number of steps; a cosine down to a hundredth, if left out.
+        model: the model's name.
+        network: creates the untrained network.
+        loss: returns the loss of a random batch, and terms to plot. It is called with the network in training mode, the
+            number of samples, the progress of the training in [0, 1), and a random generator, which differs between
+            torchrun's processes.
+        evaluate: returns further quantities to plot, on validation data; called in evaluation mode, without gradients.
+        iterations: default number of optimiser steps.
+        batch: samples per step, of all processes together.
+        rate: initial learning rate.
+        sample: name of a sample, in the plural.
+        decay: weight decay.
+        optimiser: AdamW, or Adam where a paper uses it.
+        schedule: creates the learning rate schedule from the optimiser and the number of steps; by default, a cosine
+            down to a hundredth.
         evaluations: number of evaluations and checkpoints.
         clip: maximum norm of the gradient.
-        parameters: of the network, which are trained; all of them, if left out.
-        average: decay of the exponential moving average of the parameters, which then is what is evaluated and saved.
+        parameters: the network's trained parameters; all by default.
+        average: decay of the exponential moving average of the parameters; if given, the average is evaluated and
+            saved.
     """
 
     model: str
@@ -108,7 +112,7 @@ class Recipe(Generic[Network]):
     average: float | None = None
 
     def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
-        """Train ``network`` in place, in the folder of a run; a checkpoint there is resumed."""
+        """Train ``network`` in place, in the folder of a run; resumes a checkpoint there."""
         mean = network if self.average is None else copy.deepcopy(network)
         kept = network if mean is network else nn.ModuleDict({"network": network, "mean": mean})
         parameters = network.parameters() if self.parameters is None else self.parameters(network)
@@ -136,16 +140,16 @@ class Recipe(Generic[Network]):
         started_anew: Callable[[Network], None] = lambda network: None,
         calibrated: Callable[[Network], Any] | None = None,
     ) -> Path:
-        """Train as the user asks, and write the weights with their card.
+        """Train with the user's options, and write the weights with their card.
 
         Args:
-            options: of ``steadypose train``.
-            described: the model, for the card.
-            data: what it is trained on, for the card.
-            licence: of the weights, if not their set's.
-            started_anew: fits what gradients do not, such as the scale of features, where the training begins without
-                other weights and without a checkpoint.
-            calibrated: the trained network's configuration; what it was made with, if left out.
+            options: options of ``steadypose train``.
+            described: description of the model for the card.
+            data: description of the training data for the card.
+            licence: licence of the weights; by default, their set's.
+            started_anew: fits what gradients do not fit, such as the scale of features; called if the training starts
+                without other weights and without a checkpoint.
+            calibrated: returns the trained network's configuration; by default, the original one.
 
         Returns:
             The path of the weights.
@@ -169,23 +173,23 @@ class Recipe(Generic[Network]):
 
 @torch.no_grad()
 def _move_average(mean: nn.Module, network: nn.Module, decay: float, step: int) -> None:
-    """Update the moving average of parameters; of the first steps it is nearly their plain mean."""
+    """Update the moving average of parameters. Over the first steps, it is almost their arithmetic mean."""
     for average, new in zip(mean.parameters(), network.parameters(), strict=True):
         average.lerp_(new, 1.0 - min(decay, (step + 1) / (step + 10)))
 
 
 class TrainingRun:
-    """A training that can be resumed: its state is in ``directory/checkpoint.pt``.
+    """A resumable training with its state in ``directory/checkpoint.pt``.
 
-    Under torchrun, all processes start from the state of the first, which alone writes and evaluates; each draws its
-    share of a batch, and gradients are averaged before the optimiser steps.
+    Under torchrun, all processes start from the first one's state, and only the first writes and evaluates. Each draws
+    its share of a batch, and gradients are averaged before each optimiser step.
 
     Args:
-        directory: where checkpoints, ``curves.json`` and ``curves.png`` go; a checkpoint there is resumed.
-        model: all that the checkpoint must hold: the network, or an `nn.ModuleDict` of it and, say, averaged weights
+        directory: folder of checkpoints, ``curves.json`` and ``curves.png``; a checkpoint there is resumed.
+        model: content of the checkpoint: the network, or an `nn.ModuleDict` of it and, for example, averaged weights
             that a post-step hook of the optimiser updates.
-        schedule: of the learning rate, stepped after each optimiser step.
-        iterations: steps of the whole training.
+        schedule: schedule of the learning rate, stepped after each optimiser step.
+        iterations: number of steps of the whole training.
         evaluations: number of evaluations and checkpoints.
     """
 
@@ -208,7 +212,7 @@ class TrainingRun:
             self.step, self.curves = saved["step"], saved["curves"]
             torch.set_rng_state(saved["rng"])
         if rank():
-            # the same noise on every process would be noise that does not average out
+            # equal noise on all processes would not average out
             torch.manual_seed(torch.initial_seed() + rank() + processes() * self.step)
         average_gradients(self._optimiser)
 
@@ -218,10 +222,10 @@ class TrainingRun:
         """Run the remaining steps, with evaluations, checkpoints and curves at intervals and at the end.
 
         Args:
-            loss: called with the model in training mode.
-            evaluate: quantities to plot beside the loss' terms; called in evaluation mode, without gradients.
-            batch: samples a step, of all processes together.
-            seed: of the batches.
+            loss: the loss function, called with the model in training mode.
+            evaluate: returns further quantities to plot; called in evaluation mode, without gradients.
+            batch: samples per step, of all processes together.
+            seed: random seed of the batches.
             clip: maximum norm of the gradient.
         """
         parameters = [parameter for group in self._optimiser.param_groups for parameter in group["params"]]
@@ -252,10 +256,11 @@ class TrainingRun:
         """Write the trained model, its card and its curves.
 
         Args:
-            path: ``MODEL-SET.safetensors`` in the run's folder; `training.weights.install` puts it where nodes read it.
-            model: trained.
-            config: what rebuilds it.
-            card: heading to content: model, data, licence and training; the last evaluation is added here.
+            path: ``MODEL-SET.safetensors`` in the run's folder; `training.weights.install` copies it to where nodes
+                read.
+            model: the trained model.
+            config: configuration that rebuilds the model.
+            card: heading to content: model, data, licence and training; the last evaluation is added.
 
         Returns:
             ``path``.
@@ -292,7 +297,7 @@ class TrainingRun:
 
 
 def draw_curves(curves: list[dict[str, float]], path: Path) -> None:
-    """Draw every quantity of ``curves`` against the step, one panel each, on the first process of torchrun."""
+    """Plot every quantity of ``curves`` against the step, one panel each, in the first process of torchrun."""
     if not writes():
         return
     from matplotlib.figure import Figure

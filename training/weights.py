@@ -1,4 +1,4 @@
-"""Weights as training writes them: with a card that says how they were made, and put where nodes look for them."""
+"""Writes trained weights with a card of their provenance, and installs them where nodes look for them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from steadypose.training.distributed import writes
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
-    """Write weights, in half precision, with their configuration, and the card; on the first process of torchrun.
+    """Write weights, in half precision, with configuration and card, in the first process of torchrun.
 
     Args:
-        path: ends in ``.safetensors``; the card is written beside it as ``.md``.
-        model: its state dict is saved.
-        config: what rebuilds the model, as JSON in the file's metadata.
+        path: path that ends in ``.safetensors``; the card is written beside it as ``.md``.
+        model: the model whose state dict is saved.
+        config: configuration that rebuilds the model, saved as JSON in the file's metadata.
         card: heading to content: data, licence, seed, training command, results.
     """
     if not writes():
@@ -40,9 +40,9 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
 
 
 def install(path: Path) -> Path:
-    """Copy weights, and the files that belong to them, to where nodes look for a weight set.
+    """Copy weights, and the files that belong to them, to the folder where nodes look for a weight set.
 
-    Files that they replace move to the folder ``previous`` there.
+    Replaced files are moved to the folder ``previous`` there.
 
     Args:
         path: ``MODEL-SET.safetensors`` in the folder of a training run.
@@ -60,16 +60,16 @@ def install(path: Path) -> Path:
 
 
 def arrays_of(network: nn.Module) -> Arrays:
-    """A network's weights as its live form takes them; copies."""
+    """Return copies of a network's weights for its live form."""
     return {name: tensor.detach().float().numpy().copy() for name, tensor in network.state_dict().items()}
 
 
 def started(model: nn.Module, name: str, start: str | None) -> str:
-    """Load into ``model`` the weights ``start`` of the model ``name``, if there are to be any; what a card says of it.
+    """Load the weights ``start`` of the model ``name``, if given, into ``model``; returns the note for the card.
 
     Raises:
-        FileNotFoundError: no such weights.
-        WeightsError: weights of another model, or of another size.
+        FileNotFoundError: there are no such weights.
+        WeightsError: the weights belong to another model or size.
     """
     if start is None:
         return ""
@@ -81,7 +81,7 @@ def started(model: nn.Module, name: str, start: str | None) -> str:
 
 
 def _belonging(path: Path) -> list[Path]:
-    """The files of these weights: themselves, card, curves, and what else goes by their name."""
+    """Return the files of these weights: weights, card, curves, and others with their name."""
     return [file for file in path.parent.glob(f"{path.stem}.*") if file.is_file()]
 
 

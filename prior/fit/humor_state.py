@@ -19,8 +19,7 @@ from steadypose.prior.timing.rate import FPS
 JOINT_COUNT = len(PARENTS)
 
 FEATURES = 3 + 6 * JOINT_COUNT + 3 * (JOINT_COUNT - 1) + 3 * JOINT_COUNT + 3
-"""Number of features of a state: root, 6D rotations, joints relative to the root, velocities, and the root's
-turning."""
+"""Number of features of a state: root, 6D rotations, root-relative joints, velocities, and the root's turning."""
 
 CHANGE = 3 + 3 * JOINT_COUNT
 """Number of values of a step: displacement of the root, and rotation vectors of all joints."""

@@ -1,9 +1,9 @@
-"""CMU's motion capture: Acclaim skeletons (.asf) and their motion (.amc), as the Graphics Lab distributes them, with
-their rig; and clips of its commonest conversion as exponential maps.
+"""CMU's motion capture: Acclaim skeletons (.asf) and motion (.amc) from the Graphics Lab, with their rig; and clips of
+its most common conversion as exponential maps.
 
-Training needs complete bodies, so the tables place the joints that a file lacks within a bone that is there, at the
-height the rest skeleton has them. Figures in comments are centimetres above the hips, where the rest skeleton has
-pelvis 7.5, spine1 18.5, spine2 31.5, spine3 37.5, collar 48.5, shoulder 51.5, neck 57.5, head 68.5.
+Training needs complete bodies, so the tables place missing joints within existing bones, at their heights in the rest
+skeleton. Figures in comments are centimetres above the hips; the rest skeleton has pelvis 7.5, spine1 18.5, spine2
+31.5, spine3 37.5, collar 48.5, shoulder 51.5, neck 57.5, head 68.5.
 """
 
 from __future__ import annotations
@@ -59,11 +59,12 @@ INCH = 0.0254
 def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np.float64]]]:
     """CMU clips as root translations and exponential maps (``cmu_expmap.npz``).
 
-    The archive's own positions are passed over: its offsets are those of the BVH conversion that has lost the
-    thorax and a third of the forearm, which are put back here.
+    The archive's own positions are ignored: its offsets are those of the BVH conversion, which lost the thorax and a
+    third of the forearm. These are restored here.
 
     Yields:
-        for each clip: which share of them is read, its name, frames a second, and (T, J, 3) metres, y up, for the
+        For each clip: the share of clips read, its name, frames per second, and positions (T, J, 3) metres, y up, of
+            the
         joints of the rig ``cmu_bvh``.
     """
     with open_npz(file, "names", "parents", "offsets_m", "fps") as archive:

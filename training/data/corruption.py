@@ -1,6 +1,6 @@
 """Corruption of clean windows for training: a tracker's noise, its faults, and hidden joints.
 
-A sensor's error has two parts, as `prior.clean.frame.SensorNoise` has it: jitter, independent from frame to frame, and
+As in `prior.clean.frame.SensorNoise`, a sensor's error has two parts: jitter, independent from frame to frame, and
 bias, constant or slowly varying. Windows are (B, T, 22, 3) metres, and are not changed in place.
 """
 
@@ -18,11 +18,11 @@ from steadypose.prior.timing.rate import FPS
 
 Rng = np.random.Generator
 Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
-"""Puts a tracking fault into a window (T, 22, 3), in place: into some joints, in a slice of its frames. The other
+"""Type of a tracking fault: changes some joints in a slice of the frames of a window (T, 22, 3), in place. The other
 window (T, 22, 3) is of another person, for faults that mix two bodies."""
 
 SLOW_HZ = 0.7
-"""Largest frequency of a sensor's bias, hertz."""
+"""Largest frequency of a sensor's bias, Hz."""
 
 _LIMBS = limbs(
     ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
@@ -30,7 +30,7 @@ _LIMBS = limbs(
 )  # fmt: skip
 _LOWER = [joint for leg in limbs(("hip", "knee", "ankle", "foot")) for joint in leg]
 ABSENT = [J[n] for n in ("spine1", "spine2", "spine3", "left_collar", "right_collar", "left_foot", "right_foot")]
-"""Joints that many sensors do not have."""
+"""Joints that many sensors lack."""
 
 
 def draw_bias_sigma(count: int, rng: Rng) -> Floats:
@@ -39,13 +39,13 @@ def draw_bias_sigma(count: int, rng: Rng) -> Floats:
 
 
 def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
-    """Windows with jitter of up to 10 cm, of another deviation at each joint, and with a slow bias.
+    """Add jitter of up to 10 cm, with a different deviation for each joint, and a slow bias to windows.
 
     Args:
         positions: (B, T, 22, 3) metres.
-        rng: source.
-        bias_sigma: (B,) metres along an axis, of the bias, such as `draw_bias_sigma`; half of the windows in
-            which it is 0 get no jitter either.
+        rng: random generator.
+        bias_sigma: (B,) metres along an axis, standard deviations of the bias, such as from `draw_bias_sigma`; half of
+            the windows in which it is 0 get no jitter either.
     """
     count, frames, joints, _ = positions.shape
     jitter = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
@@ -57,14 +57,14 @@ def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
 
 
 def vary_builds(positions: Floats, length_sigma: float, turn_sigma: float, rng: Rng) -> Floats:
-    """Windows of people of other bone lengths and posture (augmentation).
+    """Augment windows by varying bone lengths and posture.
 
     Args:
         positions: (B, T, 22, 3) metres.
         length_sigma: standard deviation of the logarithm of each bone's scale, which both sides share.
         turn_sigma: radians, upper bound of the standard deviation, drawn for each window, of a constant rotation of
             each bone about each axis.
-        rng: source.
+        rng: random generator.
     """
     count, joints = len(positions), len(PARENTS)
     factor = np.exp(length_sigma * rng.standard_normal((count, joints)))
@@ -83,7 +83,7 @@ JITTER_SHARE = 0.5
 
 
 def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) with jitter and a constant bias of each joint, together of ``sigma`` metres along an axis.
+    """Add jitter and a constant bias of each joint, ``sigma`` metres along an axis in total, to windows (B, T, 22, 3).
 
     `JITTER_SHARE` of the variance is jitter.
     """
@@ -93,12 +93,12 @@ def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Flo
 
 
 def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share: Floats) -> Floats:
-    """Windows with jitter and a bias that drifts: an AR(1) process, in half of them larger at some joints.
+    """Add jitter and a drifting bias (an AR(1) process) to windows; in half of them, some joints have larger errors.
 
     Args:
         positions: (B, T, 22, 3) metres.
-        sigma: (B,) metres along an axis, RMS of the error over all joints.
-        rng: source.
+        sigma: (B,) metres along an axis, RMS error over all joints.
+        rng: random generator.
         jitter_share: (B,) share of jitter in the error's variance.
     """
     count, frames, joints, _ = positions.shape
@@ -112,7 +112,7 @@ def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share
 
 
 def with_faults(clean: Floats, faults: Sequence[Fault], share: float, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3), a ``share`` of them with one of ``faults``, which in 60 % lasts to the window's end."""
+    """Add one of ``faults`` to a ``share`` of windows (B, T, 22, 3); 60 % of the faults last to the window's end."""
     corrupted = clean.copy()
     frames = clean.shape[1]
     for window in corrupted:
@@ -182,10 +182,10 @@ def jumps(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rn
 
 
 def occlude(positions: Floats, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) with joints hidden (NaN) as cameras lose them.
+    """Hide joints (NaN) of windows (B, T, 22, 3) in the way that cameras lose them.
 
-    Hidden are limbs, the lower body, subtrees, random sets of joints, single entries, joints that a sensor does not
-    have, and all frames before a body entered. Half of the gaps reach the newest frame, which matters most.
+    It hides limbs, the lower body, subtrees, random sets of joints, single entries, joints that a sensor lacks, and all
+    frames before a body entered. Half of the gaps reach the newest frame, which matters most.
     """
     seen = positions.copy()
     frames = positions.shape[1]
@@ -213,7 +213,7 @@ def occlude(positions: Floats, rng: Rng) -> Floats:
 
 
 def hide_joints(positions: Floats, count: int, rng: Rng) -> Floats:
-    """Windows (B, T, 22, 3) in each of which ``count`` random joints are NaN throughout."""
+    """Set ``count`` random joints of each window (B, T, 22, 3) to NaN in all frames."""
     hidden = rng.permuted(np.tile(np.arange(22) < count, (len(positions), 1)), axis=1)
     return np.where(hidden[:, None, :, None], np.nan, positions)
 

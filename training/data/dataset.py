@@ -22,7 +22,7 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import WeightSet
 
 MIN_SPEED = 0.25
-"""m/s, added to the joints' speed, to which the probability of drawing a fast-moving window is proportional."""
+"""Speed added to the joints' speed in the sampling weight of a window, m/s."""
 
 _ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "action",
            "source"}  # fmt: skip
@@ -35,12 +35,12 @@ class MotionSet:
     Attributes:
         rotations: (N, 22, 3, 3) local, float32.
         positions: (N, 22, 3) metres, world, z up, floor at 0.
-        offsets: (N, 22, 3) metres, the bones of the person in each frame.
+        offsets: (N, 22, 3) metres, the person's bones in each frame.
         contacts: (N, 8) labels.
         clip_start: (C + 1,) first frame of each clip, and the end.
-        subject: (C,) who moves, as the source names people; empty where the clips' origin does not matter.
-        action: (C,) what they do, as the source names it; as well.
-        source: (C,) where each is from; as well.
+        subject: (C,) person, as named by the source; empty if the clips' origin does not matter.
+        action: (C,) action, as named by the source; empty likewise.
+        source: (C,) data set; empty likewise.
     """
 
     rotations: Tensor
@@ -58,14 +58,14 @@ class MotionSet:
 
         Args:
             path: ``prepared.npz``.
-            weights: ``default`` takes the clips free for products; ``research`` takes the others too. Those that only
-                measure validate and test both, and train neither.
+            weights: ``default`` uses clips that are licensed for products; ``research`` uses the others too. Clips of
+                ``measure`` validate and test both sets, and train neither.
             split: ``train``, ``val`` or ``test``.
-            flat: leave out the clips in which somebody climbs onto things: contacts up there are not labelled.
+            flat: whether to exclude clips in which people climb onto objects, where contacts are not labelled.
 
         Raises:
-            FileNotFoundError: no such file.
-            MotionError: it is not what `prepare` writes, has no clip of this split, or there is no such set.
+            FileNotFoundError: there is no such file.
+            MotionError: the file was not written by `prepare`, has no clip of this split, or the set is unknown.
         """
         if weights not in get_args(WeightSet):
             raise MotionError(f"weights: expected one of {', '.join(get_args(WeightSet))}, got {weights!r}")
@@ -94,19 +94,19 @@ class MotionSet:
 
     @cached_property
     def person(self) -> NDArray[np.str_]:
-        """(C,) who moves, by one name in all files of a source."""
+        """(C,) the person, with the same name in all files of a source."""
         return np.array([person_of(*who) for who in zip(self.source, self.subject, strict=True)], dtype=np.str_)
 
     @property
     def hours(self) -> float:
-        """Of motion."""
+        """Duration of the motion, hours."""
         return len(self.rotations) / FPS / 3600
 
     def only(self, clips: NDArray[np.bool_]) -> MotionSet:
-        """These clips (C,) alone.
+        """Select these clips (C,).
 
         Raises:
-            ValueError: there are none.
+            ValueError: none is selected.
         """
         if not clips.any():
             raise ValueError(f"expected at least one of {len(clips)} clips, none is wanted")
@@ -121,7 +121,7 @@ class MotionSet:
     def sample(
         self, count: int, window: int, strides: Sequence[int], generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """(count, window) frame numbers: random windows inside clips, each at a random stride (a frame rate)."""
+        """(count, window) frame indices of random windows inside clips, each at a random stride (frame rate)."""
         stride = generator.choice(np.asarray(strides), size=count)
         lengths = np.diff(self.clip_start)
         starts = np.empty(count, dtype=np.int64)
@@ -133,7 +133,7 @@ class MotionSet:
         return starts[:, None] + stride[:, None] * np.arange(window)
 
     def all_windows(self, window: int, step: int) -> NDArray[np.int64]:
-        """(count, window) frame numbers of every ``step``-th window of every clip."""
+        """(count, window) frame indices of every ``step``-th window of every clip."""
         starts = [
             np.arange(a, b - window + 1, step) for a, b in zip(self.clip_start, self.clip_start[1:], strict=False)
         ]
@@ -141,11 +141,12 @@ class MotionSet:
 
 
 class SpeedWeightedWindows:
-    """Draws windows of motion, the faster the likelier, and each source by the square root of its size: a large one
-    of ten exercises would outweigh all others.
+    """Draws windows of motion with weights that grow with speed, and each source by the square root of its size.
+
+    Otherwise, a large source of ten exercises would outweigh all others.
 
     Args:
-        motion: of clips; where their sources are not given, they count as one.
+        motion: the clips; without given sources, they count as one source.
     """
 
     def __init__(self, motion: MotionSet) -> None:
@@ -173,7 +174,7 @@ class SpeedWeightedWindows:
         return first[:, None] + stride[:, None] * np.arange(window)
 
     def _chances_of(self, span: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Frames at which a window of so many can start, and the sum of their chances up to each."""
+        """Return the frames at which a window of ``span`` frames can start, and their cumulative weights."""
         starts = np.flatnonzero(self._room >= span)
         worth = self._passed[starts + span] - self._passed[starts]
         source = self._source[starts]
@@ -181,7 +182,7 @@ class SpeedWeightedWindows:
 
 
 def _prepared(path: Path, needed: set[str]) -> NpzFile:
-    """The arrays of ``prepared.npz``, not yet read; those ``needed`` are among them."""
+    """Open ``prepared.npz`` and check that it has the arrays ``needed``; reads none yet."""
     data = np.load(path) if zipfile.is_zipfile(path) else None
     if not isinstance(data, NpzFile):
         raise MotionError(f"{path}: expected the .npz that 'steadypose prepare' writes")
@@ -191,7 +192,7 @@ def _prepared(path: Path, needed: set[str]) -> NpzFile:
 
 
 def describe_data(weights: str, train: MotionSet, val: MotionSet) -> str:
-    """The data that weights were trained on, for their card."""
+    """Describe the training data of weights, for their card."""
     return (
         f"the '{weights}' set of `steadypose prepare`: {train.hours:.2f} h training, {val.hours:.2f} h validation, "
         "split by subject"
@@ -199,11 +200,11 @@ def describe_data(weights: str, train: MotionSet, val: MotionSet) -> str:
 
 
 def mirror_rotations(rotations: Tensor) -> Tensor:
-    """Exchange left and right in local rotations (..., 22, 3, 3), as a mirror across the body's xz plane does."""
+    """Mirror local rotations (..., 22, 3, 3) across the body's xz plane, which exchanges left and right."""
     flip = rotations.new_tensor([1.0, -1.0, 1.0])
     return rotations[..., MIRROR.tolist(), :, :] * flip[:, None] * flip
 
 
 def mirror_offsets(offsets: Tensor) -> Tensor:
-    """Exchange left and right in bones or root-centred positions (..., 22, 3), across the xz plane."""
+    """Mirror bones or root-centred positions (..., 22, 3) across the xz plane, which exchanges left and right."""
     return offsets[..., MIRROR.tolist(), :] * offsets.new_tensor([1.0, -1.0, 1.0])

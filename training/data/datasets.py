@@ -1,7 +1,7 @@
-"""The data sets that are known: who moves in them, under which licence, and what is held out to validate and to test.
+"""The known data sets: their people, their licences, and the parts held out for validation and test.
 
-What is held out is never a random choice of frames or clips where the subject is known: the motion model would be
-measured on people it has learnt. A person is in one split only.
+If subjects are known, people are held out, never random frames or clips: otherwise the model would be evaluated on
+people of its training. Each person is in only one split.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from steadypose.training.data.readers import (
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 CMU_LICENCE = "CMU mocap: free, no resale"
-"""Free for all uses, products included; the data itself may not be resold; acknowledge NSF EIA-0196217."""
+"""Licence of CMU's data: free for all uses including products; the data may not be resold; acknowledge NSF
+EIA-0196217."""
 
 CMU_FPS = 120.0
-"""Frames a second of CMU's AMC files, which do not state it."""
+"""Frame rate of CMU's AMC files, which do not contain it, frames per second."""
 
 CMU_ACTIONS = {
     "01": "playground",
@@ -86,29 +87,29 @@ REPEATS = {
     "14_12": "test_washwindow_1",
     "14_36": "14_31",
 }
-"""Recordings that two CMU archives hold: the one left out, and the one kept (nearer to the source, or validating).
+"""Recordings that are in two CMU archives: the dropped one, and the kept one (nearer to the source, or for validation).
 
-Found by the bends of elbows and knees, frame by frame: 0.1 degrees apart for AMC and exponential maps, below 1.7 for
-the hobbyist's BVH, against more than 5 between any two other recordings at the same lag. Those of `cmu_more` stand on
-another body, whose elbows and knees are bent by 11 to 16 degrees more all the time: that taken off, 0.4 to 2.5 degrees
-for two of one length, and 2.7 or more for the next.
+They were identified by the bends of elbows and knees, frame by frame. These differ by 0.1 degrees for AMC and
+exponential maps, by less than 1.7 for the hobbyist's BVH, and by more than 5 between any two other recordings at the
+same lag. Those of `cmu_more` use another body, whose elbows and knees are always bent by 11 to 16 degrees more. Without
+this offset, two recordings of one length differ by 0.4 to 2.5 degrees, and the next ones by 2.7 or more.
 """
 
 NORMALISED = "first2s"
-"""The folder of `cmu_more` whose takes somebody has stretched to 240 frames, whatever they lasted: walks and runs all
-take one step a second there, and those that are also in `cmu_more` itself match it at 0.5 to 0.6 of their speed, jumps
-at 1.3 to 2. No file says by how much, and motion at a wrong speed teaches wrong speeds."""
+"""Folder of `cmu_more` whose takes are all stretched to 240 frames. Walks and runs there all take one step per second.
+Takes that are also in `cmu_more` itself match it at 0.5 to 0.6 of their speed, jumps at 1.3 to 2. No file states the
+factor, and motion at a wrong speed would teach wrong speeds."""
 
 Split = Literal["train", "val", "test"]
-"""What a recording may be used for: nothing is chosen on ``test``."""
+"""Split of a recording; nothing may be chosen on ``test``."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 WeightSet = Literal["default", "research"]
 
 Use = Literal["default", "research", "measure"]
-"""Which weights a recording may train: ``default`` all of them, ``research`` those that are not for products, and
-``measure`` none: it validates and tests."""
+"""Weights that a recording may train: ``default`` trains all, ``research`` those that are not for products, and
+``measure`` none; it only validates and tests."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,9 @@ class DataSet:
     """A source of motion.
 
     Attributes:
-        name: of the source.
-        files: a pattern (regex) of the names of the files or folders that hold it.
-        weights: which weights models trained on it may become.
+        name: name of the source.
+        files: regular expression of the names of its files or folders.
+        weights: weights that it may train.
         read: reads a file or folder.
         split: assigns a clip to training, validation or test.
     """
@@ -130,7 +131,7 @@ class DataSet:
     split: Callable[[Clip], Split]
 
     def matches(self, path: Path) -> bool:
-        """Whether a file or folder holds it, by its name."""
+        """Whether a file or folder contains it, by its name."""
         return re.fullmatch(self.files, path.name) is not None
 
 
@@ -150,7 +151,7 @@ def _repeat(name: str, source: str) -> Dropped:
 
 
 class _Origin(NamedTuple):
-    """What the path of a recording, and its skeleton, say of its origin."""
+    """Origin of a recording, from its path and skeleton."""
 
     name: str
     subject: str
@@ -191,7 +192,7 @@ def _origin_cmu_more(name: str, _bvh: Bvh) -> _Origin:
 
 
 def _origin_kind(name: str, _bvh: Bvh) -> _Origin:
-    """All stand on one skeleton; who dances is not given, but no one of one kind is in another."""
+    """All takes have the same skeleton. Dancers are not named, but no dancer of one kind is in another."""
     kind = PurePosixPath(name).parent.name
     return _Origin(f"{kind}_{stem_of(name)}", kind, kind)
 
@@ -202,7 +203,7 @@ def _origin_reactidle(name: str, _bvh: Bvh) -> _Origin:
 
 
 def _origin_bandai(name: str, bvh: Bvh) -> _Origin:
-    """All bones have been retargeted to one body; the place of the hips in the rest pose differs by session."""
+    """All takes are retargeted to one body. The position of the hips in the rest pose differs by session."""
     session = " ".join(f"{v:.1f}" for v in bvh.offsets[bvh.joints.index("Hips")])
     return _Origin(stem_of(name), session, " ".join(stem_of(name).split("_")[1:-1]))
 
@@ -251,31 +252,31 @@ def _held_out(test: bool) -> Split:
 
 
 def _own_split(clip: Clip) -> Split:
-    """By the folders that a recording of the user's own lies in."""
+    """Return the split of a user's own recording, from its folders."""
     folders = PurePosixPath(clip.name).parts
     return "val" if "val" in folders else "test" if "test" in folders else "train"
 
 
 CMU_VALIDATION = frozenset({"02"})
-"""Subjects of the AMC recordings; all ten of subject 02's are among them, so that no other archive has more of them."""
+"""Validation subjects of the AMC recordings. All ten recordings of subject 02 are in this archive."""
 
 DANCE_TRAINING = frozenset({"salsa"})
-"""Kinds, and so people: the others (martial arts, Indian dance) are the test split."""
+"""Kinds for training, and so people; the others (martial arts, Indian dance) are the test split."""
 
 REACTIDLE_VALIDATION = ("013", "014", "015")
-"""Subjects."""
+"""Validation subjects."""
 
 BANDAI_VALIDATION = "-17.2 93.2 453.0"
-"""The rest pose's hips of the session held out: one of the second set's three, 807 clips."""
+"""Hips of the rest pose in the validation session, one of the second set's three sessions, 807 clips."""
 
 AMASS_VALIDATION = frozenset({"HumanEva", "MPI_HDM05", "HDM05", "SFU", "MPI_mosh", "MoSh"})
-"""Folders that hold the parts HM-VAE validates on (the names of both of AMASS' releases)."""
+"""Folders of the parts on which HM-VAE validates (names in both AMASS releases)."""
 
 DANCEDB_VALIDATION = frozenset({"Andria", "Elena"})
-"""Dancers; Anna, Olivia and Theodora are the test split."""
+"""Validation dancers; Anna, Olivia and Theodora are the test split."""
 
 LAFAN1_VALIDATION = "subject1"
-"""An actor; subjects 2 to 4 are the test split."""
+"""Validation actor; subjects 2 to 4 are the test split."""
 
 DATA_SETS: tuple[DataSet, ...] = (
     # The unnamed expmap clips may be of subjects 06 and 07: all of these train.
@@ -325,4 +326,4 @@ DATA_SETS: tuple[DataSet, ...] = (
         _own_split,
     ),
 )  # fmt: skip
-"""In the order of preparation. What a user puts into a folder ``own`` is theirs to train on: the default set."""
+"""All data sets, in the order of preparation. A user's own recordings in a folder ``own`` train the default set."""

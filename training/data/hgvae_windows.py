@@ -1,4 +1,4 @@
-"""Windows of prepared motion as HG-VAE takes them."""
+"""Windows of prepared motion as HG-VAE's input."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from steadypose.training.data.dataset import MotionSet, mirror_offsets
 from steadypose.training.networks.hgvae import HGVAE
 
 STRIDES = (1, 1, 1, 2)
-"""Frame strides of training windows: every fourth is played at twice the speed, as most recordings are slow."""
+"""Frame strides of training windows; a quarter is played at twice the speed, because most recordings are slow."""
 
 
 class Windows:
@@ -43,7 +43,7 @@ class Batch(NamedTuple):
     """Windows as tensors.
 
     Attributes:
-        x: (B, 66, T) tracks less the model's mean, in units of `SCALE`; interpolated where not observed.
+        x: (B, 66, T) tracks minus the model's mean, in units of `SCALE`; interpolated where unobserved.
         observed: (B, 66, T) 1 where observed.
         certainty: (B, 66, T) of x: 1 where observed; elsewhere 0 until it is `completed`.
         target: (B, 66, T) ground truth in the same frame.
@@ -58,7 +58,7 @@ class Batch(NamedTuple):
 
     @classmethod
     def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats) -> Batch:
-        """From observed and true positions (B, T, 22, 3) metres, NaN where not observed, and body sizes (B,)."""
+        """Build a batch from observed and true positions (B, T, 22, 3) metres, NaN where unobserved, and sizes (B,)."""
         tracks = [to_tracks(window, size) for window, size in zip(seen, sizes, strict=True)]
         true = [in_frame_of(t, window, size) for t, window, size in zip(tracks, truth, sizes, strict=True)]
         observed = torch.from_numpy(np.stack([t.observed for t in tracks])).float()
@@ -69,7 +69,7 @@ class Batch(NamedTuple):
     def completed(self, model: HGVAE, bias_sigma: Floats | float) -> Batch:
         """The batch with its unobserved entries completed by the model.
 
-        ``bias_sigma`` (B,) metres along an axis: the sensor's slow error.
+        ``bias_sigma`` (B,) is the sensor's bias, metres along an axis.
         """
         x, certainty = model.completed(self.x, self.observed, bias_sigma)
         return self._replace(x=x, certainty=certainty)
@@ -80,7 +80,7 @@ class Batch(NamedTuple):
 
 
 def standardise(model: HGVAE, x: Floats) -> Tensor:
-    """Tracks (B, 66, T) metres less the model's mean, in units of `SCALE`, without NaN; see `hang_unseen`."""
+    """Return tracks (B, 66, T) metres minus the model's mean, in units of `SCALE`, without NaN (see `hang_unseen`)."""
     deviations = (x - model.mean.double().numpy()[:, None]) / SCALE
     hang_unseen(deviations)
     return torch.from_numpy(deviations).float()

@@ -1,4 +1,4 @@
-"""From recordings to training data: complete bodies at 30 Hz, on a floor, checked, labelled and split."""
+"""Converts recordings to training data: complete bodies at 30 Hz on a floor, checked, labelled and split."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from steadypose.training.data.datasets import Split, Use
 from steadypose.training.data.readers import Dropped
 
 FPS = 30.0
-"""Frames a second of everything that is trained on."""
+"""Frame rate of all training data, frames per second."""
 
 CUTOFF = 12.0
-"""Hz, cut-off of the low pass before resampling to 30 Hz, against aliasing."""
+"""Cut-off frequency of the anti-aliasing filter before resampling to 30 Hz, Hz."""
 
 FAST_ENOUGH = 50.0
-"""Frames a second of recordings that can be played faster and still show at 30 Hz what the body did."""
+"""Least frame rate of a recording that may be played faster, frames per second; a slower one lacks motion at 30 Hz."""
 
 MAX_GAP = 0.2
-"""Seconds. A joint lost for no longer is interpolated; for longer, the recording is cut there."""
+"""Longest gap of a joint that is interpolated, seconds; at longer gaps, the recording is cut."""
 
 MIN_SECONDS = 1.0
-"""Shorter recordings are dropped, as in HuMoR."""
+"""Least duration of a recording, seconds; shorter ones are dropped, as in HuMoR."""
 
 MAX_BONE_CHANGE = 0.10
-"""Metres that a bone may differ from its median in the recording. Bones found from skin markers vary by 1 to 3 cm
-(standard deviation); a marker mistaken for another changes them by more than this."""
+"""Largest difference of a bone from its median in the recording, metres. Bones computed from skin markers vary by 1 to
+3 cm (standard deviation); a mislabelled marker changes them by more than this."""
 
 MAX_ACCELERATION = 200.0
-"""m/s², second difference at 30 Hz. The hardest real motion of these recordings, a kicking foot, reaches 195; a joint
-that jumps to another place and back by 15 cm reaches 270."""
+"""Largest acceleration (second difference at 30 Hz), m/s². The fastest real motion of these recordings, a kicking foot,
+reaches 195; a joint that jumps by 15 cm and back reaches 270."""
 
 TOE_HEIGHT = 0.015
-"""Metres above the floor at which the forefoot's joint rests."""
+"""Height above the floor of the forefoot's joint at rest, metres."""
 
 RAISED = 0.12
-"""Metres above the floor from which a lower toe that stands still must be standing on something else."""
+"""Height above the floor above which a lower toe that stands still is on something else, metres."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Prepared:
         speed: factor by which it is sped up.
         offsets: (22, 3) metres, its subject's bones.
         rotations: (T, 22, 4) local, xyzw.
-        contacts: (T, 8).
-        flat: whether it stays on the floor; where somebody climbs onto things, contacts up there are not labelled.
+        contacts: (T, 8) labels.
+        flat: whether the person stays on the floor; contacts on raised objects are not labelled.
     """
 
     clip: Clip
@@ -81,9 +81,9 @@ class Prepared:
 
 
 def at_speed(clip: Clip, speed: float) -> Clip | None:
-    """The clip played faster, named so; None where its frames do not suffice: those at `FAST_ENOUGH` a second do.
+    """Return the clip played faster, and named so; None if it was recorded at less than `FAST_ENOUGH`.
 
-    Faster than it was, a motion has frequencies at 30 Hz that its recording at 30 Hz has not.
+    A motion that is sped up has frequencies at 30 Hz that its recording at 30 Hz lacks.
     """
     if speed == 1.0:
         return clip
@@ -91,13 +91,13 @@ def at_speed(clip: Clip, speed: float) -> Clip | None:
 
 
 def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> Iterator[Prepared | Dropped]:
-    """Resample, find the floor, check and label a recording.
+    """Resample a recording, estimate its floor, check and label it.
 
-    Yields its good parts, and what is left out and why. A recording is cut where joints are lost or do what no body
-    does; a part of one is named by the second it begins at.
+    Yields its valid parts, and the dropped parts with the reasons. A recording is cut where joints are lost or move
+    impossibly. A part is named by the second at which it begins.
 
     Args:
-        clip: as read, or `at_speed`.
+        clip: the clip as read, or from `at_speed`.
         weights: the set of weights it may train.
         split: training, validation or test.
         speed: factor by which it is sped up, which raises the limit of accelerations.
@@ -152,11 +152,11 @@ def _label(clip: Clip, weights: Use, split: Split, speed: float) -> Prepared:
 
 
 def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """Interpolate, in a straight line, joints that are lost for at most `MAX_GAP`; longer gaps stay NaN.
+    """Interpolate joints linearly that are lost for at most `MAX_GAP`; longer gaps stay NaN.
 
     Args:
         positions: (T, J, 3), NaN where lost.
-        fps: frames a second.
+        fps: frames per second.
     """
     filled = positions.copy()
     lost = ~finite_joints(positions)
@@ -174,16 +174,16 @@ def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]
 
 
 def runs(mask: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Starts and stops of the runs of True."""
+    """Yield start and stop of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def resample(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """(T, J, 3) at ``fps`` to (T', J, 3) at 30 Hz, by time, the first frame staying the first.
+    """Resample (T, J, 3) at ``fps`` to (T', J, 3) at 30 Hz by time, starting at the first frame.
 
-    Faster recordings pass a Butterworth filter of fourth order at 12 Hz, forwards and backwards so that nothing is
-    delayed; then all are read off a cubic spline. A blow's impact loses what it has above 12 Hz.
+    Faster recordings are filtered by a fourth-order Butterworth filter at 12 Hz, forwards and backwards for zero delay.
+    All are then interpolated by a cubic spline. Impacts lose their frequencies above 12 Hz.
     """
     if abs(fps / FPS - 1) < 1e-4:
         return positions.copy()
@@ -195,10 +195,10 @@ def resample(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
 
 
 def floor_height(positions: NDArray[np.float64]) -> float:
-    """Height of the floor (metres) under a recording at 30 Hz, from where toes come to rest.
+    """Estimate the height of the floor under a recording at 30 Hz from resting toes, metres.
 
-    HuMoR's idea: the lowest heights at which toes stand still (their fifth percentile, safe from outliers). Where
-    none ever does (a run in mid-stride), the second percentile of the lower toe.
+    As in HuMoR, it is the lowest height at which toes stand still (their fifth percentile, robust to outliers). If none
+    does (a run in mid-stride), it is the second percentile of the lower toe.
     """
     toes, speed = _toes(positions)
     still = toes[..., 2][speed < REST_SPEED]
@@ -207,7 +207,7 @@ def floor_height(positions: NDArray[np.float64]) -> float:
 
 
 def stays_on_floor(positions: NDArray[np.float64]) -> bool:
-    """Whether, in a recording at 30 Hz with its floor at 0, the lower toe hardly ever rests above it."""
+    """Whether the lower toe hardly ever rests above the floor, in a recording at 30 Hz with its floor at 0."""
     toes, speed = _toes(positions)
     lower = toes[..., 2].argmin(axis=1)[:, None]
     height = np.take_along_axis(toes[..., 2], lower, axis=1)
@@ -216,7 +216,7 @@ def stays_on_floor(positions: NDArray[np.float64]) -> bool:
 
 
 def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (T, 2, 3) and speeds (T, 2) of both toes."""
+    """Return positions (T, 2, 3) and speeds (T, 2) of both toes."""
     toes = positions[:, [J["left_foot"], J["right_foot"]]]
     return toes, np.linalg.norm(np.gradient(toes, 1 / FPS, axis=0), axis=-1)
 
@@ -224,9 +224,9 @@ def _toes(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 def find_faults(
     positions: NDArray[np.float64], max_acceleration: float = MAX_ACCELERATION
 ) -> tuple[NDArray[np.bool_], str]:
-    """Frames (T,) of (T, 22, 3) positions at 30 Hz in which a body does what none can, and the worst of it in words.
+    """Return the frames (T,) of positions (T, 22, 3) at 30 Hz with impossible motion, and a description of the worst.
 
-    The words are empty where there is nothing.
+    The description is empty if there is none.
     """
     bad = np.zeros(len(positions), dtype=bool)
     words: list[str] = []
@@ -248,7 +248,7 @@ def find_faults(
 
 
 def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
-    """Write ``prepared.npz``: whole, or not at all.
+    """Write ``prepared.npz`` atomically.
 
     Arrays: ``positions`` (N, 22, 3) float32 metres, z up, floor 0, all recordings in a row at 30 Hz; ``rotations``
     (N, 22, 4) float32 local, xyzw; ``contacts`` (N, 8) bool; ``offsets`` (C, 22, 3) float32 metres; ``clip_start``

@@ -1,4 +1,4 @@
-"""From archives, folders and files to recordings: each as it is read, or the reason why it is left out."""
+"""Reads recordings from archives, folders and files; yields each recording, or the reason why it is dropped."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, fil
 from steadypose.training.data.cmu import CMU_AMC, Asf, read_amc, read_asf
 
 REST_POSE_SPEED = 30.0
-"""m/s. No body does this: a first frame that is left faster is a rest pose that a converter has put in front."""
+"""Speed that no body reaches, m/s; a first frame that is left faster is a rest pose inserted by a converter."""
 
 LEAVING_SPEED, REST_POSE_SECONDS = 5.0, 0.1
-"""m/s, seconds. Converters that filter blend the rest pose into the motion: frames that are left faster than this, so
-soon after it, go too (five of `cmu_dance`'s at 120 Hz)."""
+"""Speed, m/s, and time after an inserted rest pose, seconds, at which frames are dropped too. Converters that filter
+blend the rest pose into the motion (five frames of `cmu_dance` at 120 Hz)."""
 
 UNREADABLE = "cannot be read"
 
 
 @dataclass(frozen=True)
 class Dropped:
-    """A recording, or a part of one, that does not go into training, and why.
+    """A recording, or a part of one, that is excluded from training, with the reason.
 
     Attributes:
-        name: of the recording.
+        name: name of the recording.
         source: its data set.
-        kind: the cause in general words, to count by.
+        kind: general cause, for counting.
         cause: the cause in this case, with its figures.
     """
 
@@ -47,16 +47,16 @@ class Dropped:
 
 
 Progress = Callable[[float], None]
-"""Called with the share of a file, 0 to 1, that has been read."""
+"""Type of a progress callback, called with the share of a file, 0 to 1, that has been read."""
 
 
 def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of the files with some suffix in an archive (.tar, .tar.xz, ...), folder, or file.
+    """Yield names and contents of files with these suffixes in an archive (.tar, .tar.xz, ...), a folder, or a file.
 
-    Archives are read as a stream, in their own order; folders by name.
+    Archives are read as a stream, in their own order; folders are read by name.
 
     Raises:
-        MotionError: the archive is cut short or none.
+        MotionError: the file is no archive, or is truncated.
     """
     if path.is_file() and path.suffix not in suffixes:
         size = path.stat().st_size
@@ -92,7 +92,7 @@ def bvh_motion(text: str) -> tuple[Bvh, Skeleton, Floats]:
 
 
 def _rest_frames(positions: Floats, fps: float) -> int:
-    """How many frames at the start are a rest pose that a converter has put in front, and the way out of it."""
+    """Return the number of frames at the start that are an inserted rest pose or the transition from it."""
     start = positions[: max(2, round(REST_POSE_SECONDS * fps) + 1)]
     speed = np.abs(np.diff(start, axis=0)).max(axis=(1, 2), initial=0.0) * fps
     if not len(speed) or speed[0] <= REST_POSE_SPEED:
@@ -101,7 +101,7 @@ def _rest_frames(positions: Floats, fps: float) -> int:
 
 
 def _select(rig: Rig, joints: Sequence[str], positions: Floats) -> Floats:
-    """The rig's joints of (T, J, 3), in metres, z up."""
+    """Select the rig's joints of (T, J, 3), in metres, z up."""
     missing = set(rig.skeleton.joints) - set(joints)
     if missing:
         raise MotionError(f"expected the joints of '{rig.skeleton.name}', lacks {', '.join(sorted(missing))}")
@@ -111,14 +111,14 @@ def _select(rig: Rig, joints: Sequence[str], positions: Floats) -> Floats:
 
 
 def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, Floats | MotionError]]:
-    """Names and positions (T, J, 3), metres, z up, of AMC files; of one that cannot be read, the reason.
+    """Yield names and positions (T, J, 3) metres, z up, of AMC files; for an unreadable file, the reason.
 
     The skeleton of ``01/01_05.amc`` is the ``.asf`` in the same folder.
     """
     skeletons: dict[str, Asf | MotionError] = {}
     waiting: list[tuple[str, str]] = []
     for name, content in members(path, (".asf", ".amc"), lambda share: progress(0.3 * share)):
-        # An archive has its files in any order.
+        # an archive may have its files in any order
         if name.endswith(".asf"):
             try:
                 skeletons[folder_of(name)] = read_asf(content.decode("ascii", "replace"))
@@ -142,22 +142,22 @@ def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, Floats | 
 
 
 def folder_of(name: str) -> str:
-    """The folder that a file of an archive lies in."""
+    """Return the folder of a file in an archive."""
     return PurePosixPath(name).parent.as_posix()
 
 
 def stem_of(name: str) -> str:
-    """A file's name without folder and suffix."""
+    """Return a file's name without folder and suffix."""
     return PurePosixPath(name).stem
 
 
 def read_own(path: Path, progress: Progress, description: Description = UNDESCRIBED) -> Iterator[Clip | Dropped]:
-    """The files of motion of anybody's folder, archive, or of one file; the folder that each lies in is a person's.
+    """Read the motion files of a user's folder, archive or file. Each file's folder names its person.
 
     Args:
-        path: of these.
+        path: folder, archive or file.
         progress: called with the share that is read.
-        description: what the files do not say.
+        description: properties that the files lack.
     """
     for name, content in members(path, SUFFIXES, progress):
         try:

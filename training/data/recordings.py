@@ -1,4 +1,5 @@
-"""Motion to train and validate the mixture on, at several speeds, and the real Kinect beside Vicon, as plain arrays."""
+"""Training and validation data of the mixture as plain arrays: motion at several speeds, and a real Kinect with
+Vicon."""
 
 from __future__ import annotations
 
@@ -37,9 +38,9 @@ class Motion:
 
     Attributes:
         positions: (N, 22, 3) float32 metres, z up.
-        start: (C + 1,) of each recording.
-        source: (C,) the data set's name.
-        speed: (C,) how many times faster than recorded.
+        start: (C + 1,) first frame of each recording, and the end.
+        source: (C,) name of the data set.
+        speed: (C,) factor by which the recording is sped up.
     """
 
     positions: NDArray[np.float32]
@@ -54,9 +55,9 @@ class Pairs:
 
     Attributes:
         seen: (N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint.
-        truth: (N, 22, 3) metres, of the Vicon, by the Kinect's definition of the joints; NaN where not known.
-        start: (C + 1,) of each recording.
-        subject: (C,).
+        truth: (N, 22, 3) metres, from the Vicon, with the Kinect's joint definitions; NaN where unknown.
+        start: (C + 1,) first frame of each recording, and the end.
+        subject: (C,) the person.
     """
 
     seen: NDArray[np.float32]
@@ -65,7 +66,7 @@ class Pairs:
     subject: NDArray[np.str_]
 
     def of(self, subjects: Collection[str]) -> Pairs:
-        """The recordings of these subjects."""
+        """Return the recordings of these subjects."""
         clips = np.flatnonzero(np.isin(self.subject, list(subjects)))
         rows = np.concatenate([np.arange(*self.start[c : c + 2]) for c in clips])
         lengths = np.diff(self.start)[clips]
@@ -74,9 +75,9 @@ class Pairs:
 
 
 def write_arrays(mocap: Path, out: Path) -> None:
-    """Read the recordings under ``mocap`` that are free for products, and write ``motion-SPLIT.npz`` and ``pairs.npz``.
+    """Read the recordings under ``mocap`` that are licensed for products; write ``motion-SPLIT.npz`` and ``pairs.npz``.
 
-    Recordings of the test split are left out.
+    Recordings of the test split are excluded.
 
     Raises:
         MotionError: there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
@@ -109,8 +110,11 @@ def write_arrays(mocap: Path, out: Path) -> None:
 
 
 def _split(clip: Clip, data: DataSet) -> Split:
-    """The split of `training.data.datasets`, except that a person must be in one split only: all of CMU's 02 is for
-    validation, and clips of unknown subjects, which other splits may contain, are for training."""
+    """Return the split of `training.data.datasets`, with two exceptions so that each person is in only one split.
+
+    All clips of CMU's subject 02 are for validation. Clips of unknown subjects, who may be in other splits, are for
+    training.
+    """
     if data.name == "CMU (AMC)":
         return "val" if clip.subject == "02" else "train"
     return "train" if data.name == "CMU (expmap)" else data.split(clip)
@@ -129,7 +133,7 @@ def load_kinect(path: Path) -> Pairs:
 
 
 def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, NDArray[np.float32]]]:
-    """The parts of a recording without faults, sped up and resampled to 30 Hz."""
+    """Yield the faultless parts of a recording, sped up and resampled to 30 Hz."""
     clip = clip.canonical()
     if clip.seconds < 1.0:
         return
@@ -175,11 +179,11 @@ def _write_pairs(path: Path, out: Path) -> None:
         start=np.concatenate([[0], np.cumsum([len(s) for s in seen])]),
         subject=np.array(names),
     )
-    part.replace(out)  # whole or not at all: its presence says that all arrays are written
+    part.replace(out)  # atomic: its existence means that all arrays are written
 
 
 def trunk_frame(positions: Floats) -> Floats:
-    """Axes forward, left, up of the trunk as columns (..., 3, 3), of joints (..., 22, 3)."""
+    """Return the trunk's axes forward, left, up as columns (..., 3, 3), from joints (..., 22, 3)."""
     left_hip, right_hip, left_shoulder, right_shoulder = (positions[..., J[name], :] for name in _TRUNK)
     up = left_shoulder + right_shoulder - left_hip - right_hip
     up = up / np.linalg.norm(up, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Simulated sensors for the training of the mixture: errors from none to 8 cm."""
+"""Simulated sensors for training the mixture, with errors from 0 to 8 cm."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from steadypose.training.data.recordings import Motion, Pairs
 Rng = np.random.Generator
 
 GATED = 0.18
-"""Metres: 90 % of larger jumps are removed, as the gate would before the mixture."""
+"""Size of jumps above which 90 % are removed, as by the gate before the mixture, metres."""
 
 KINDS = ("perfect", "white", "coloured", "replayed", "mixed", "kinect", "monocular")
 SHARES = np.array([0.13, 0.25, 0.15, 0.11, 0.11, 0.13, 0.12])
-"""Kinds of sensors and their shares: no error, white noise, AR(1) noise, a real Kinect's errors added to other motion,
-all of these together, the real Kinect's recordings, and a monocular network, which errs in the depth of each bone."""
+"""Shares of the kinds of sensors: no error, white noise, AR(1) noise, a real Kinect's errors added to other motion, all
+of these together, the real Kinect's recordings, and a monocular network with errors in each bone's depth."""
 
 TURNED = 0.25
-"""Share of clips in which people are turned as a whole, and lie, stand on their hands or roll."""
+"""Share of clips in which the whole body is turned, so that people lie, stand on their hands or roll."""
 
 CARRIED = 0.15
-"""Share of clips as a moving camera sees them that does not know its pose: a robot's, or one that is bumped into."""
+"""Share of clips from a moving camera with unknown pose, such as a robot's or one that is bumped into."""
 
 _SWINGS = (
     ("elbow", ("wrist",)),
@@ -50,9 +50,10 @@ class Sensed:
     """Clips as observed by simulated sensors.
 
     Attributes:
-        seen: (C, T, 22, 3) metres, NaN where not seen.
-        truth: (C, T, 22, 3) metres, NaN where not known.
-        confidence: (C, T, 22) 0 to 1, as the sensor states it; in 70 % of clips the noise is inversely proportional.
+        seen: (C, T, 22, 3) metres, NaN where unobserved.
+        truth: (C, T, 22, 3) metres, NaN where unknown.
+        confidence: (C, T, 22) 0 to 1, the sensor's confidence; in 70 % of clips, the noise is inversely proportional to
+            it.
         kind: (C,) index into `KINDS`.
     """
 
@@ -66,7 +67,7 @@ class Sensors:
     """Draws clips of motion and simulates sensors on them."""
 
     def __init__(self, motion: Motion, pairs: Pairs, frames: int) -> None:
-        """``frames`` of each clip; ``pairs`` of the training subjects."""
+        """``frames`` is the length of a clip; ``pairs`` are recordings of the training subjects."""
         self._motion, self._pairs, self._frames = motion, pairs, frames
         sources = sorted(set(motion.source))
         room = np.maximum(np.diff(motion.start) - frames, 0).astype(float)
@@ -81,7 +82,7 @@ class Sensors:
         self._pair_weight = np.maximum(lengths - 20, 0) / np.maximum(lengths - 20, 0).sum()
 
     def draw(self, count: int, rng: Rng) -> Sensed:
-        """``count`` clips."""
+        """Draw ``count`` clips."""
         kind = rng.choice(len(KINDS), count, p=SHARES)
         truth = self._true(count, rng)
         seen = truth.copy()
@@ -120,10 +121,9 @@ class Sensors:
         return truth
 
     def _residual(self, rng: Rng) -> Floats:
-        """(T, 22, 3) metres, errors of the real Kinect, rotated about the vertical; joints that it lacks take their
-        parent's.
+        """(T, 22, 3) metres, errors of the real Kinect, rotated about the vertical.
 
-        Recordings that are shorter than a clip are played forwards and backwards.
+        Joints that it lacks get their parent's error. Recordings shorter than a clip are played forwards and backwards.
         """
         start = self._pairs.start
         clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
@@ -142,7 +142,7 @@ class Sensors:
         return rng.uniform(0.6, 1.4) * error @ Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix().T
 
     def _noise(self, kind: str, truth: Floats, rng: Rng) -> Floats:
-        """(T, 22, 3) metres, the error of a sensor of this kind."""
+        """(T, 22, 3) metres, errors of a sensor of this kind."""
         shape = truth.shape
         if kind == "perfect":
             return 10 ** rng.uniform(-4, -3) * rng.standard_normal(shape) if rng.random() < 0.15 else np.zeros(shape)
@@ -227,8 +227,10 @@ class Sensors:
 
 
 def sound(pairs: Pairs, threshold: float = 0.05) -> NDArray[np.bool_]:
-    """(C,) recordings in which Kinect and Vicon differ by less than ``threshold`` metres in the median: in others, one
-    of them lost the person."""
+    """(C,) recordings in which Kinect and Vicon differ by less than ``threshold`` metres (median).
+
+    In other recordings, one of the two lost the person.
+    """
     error = np.linalg.norm(pairs.seen - pairs.truth, axis=-1)
     return np.array([np.nanmedian(error[a:b]) < threshold for a, b in zip(pairs.start, pairs.start[1:], strict=False)])
 
@@ -258,8 +260,11 @@ def _shaking(truth: Floats, rng: Rng) -> Floats:
 
 
 def _monocular_errors(truth: Floats, rng: Rng) -> Floats:
-    """(T, 22, 3) metres, errors of a monocular network: the depth of each bone errs, by coloured noise and by jumps,
-    and errors add up along the kinematic chain; across the line of sight they are small."""
+    """(T, 22, 3) metres, errors of a monocular network.
+
+    Each bone's depth has coloured noise and jumps, and errors accumulate along the kinematic chain. Errors across the
+    line of sight are small.
+    """
     frames = len(truth)
     view = rng.standard_normal(3) * (1.0, 1.0, 0.2)
     view /= np.linalg.norm(view)
@@ -278,8 +283,11 @@ def _monocular_errors(truth: Floats, rng: Rng) -> Floats:
 
 
 def _carry(truth: Floats, rng: Rng) -> None:
-    """Move a clip as a whole, smoothly, in place: it sways by up to 0.5 g at 0.1 to 3 Hz, turns about a camera 1 to 4 m
-    away by up to 1.5 rad/s, or is displaced at once."""
+    """Move a whole clip smoothly, in place.
+
+    It sways by up to 0.5 g at 0.1 to 3 Hz, turns about a camera 1 to 4 m away by up to 1.5 rad/s, or is displaced at
+    once.
+    """
     time, amplitude = np.arange(len(truth)) / FPS, 10 ** rng.uniform(-1.0, 0.0)
     towards = rng.uniform(0.0, 2 * np.pi)
     camera = truth[0, 0] + rng.uniform(1.0, 4.0) * np.array([np.cos(towards), np.sin(towards), 0.0])
@@ -297,8 +305,10 @@ def _carry(truth: Floats, rng: Rng) -> None:
 
 
 def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
-    """Turn a clip about its first root by any rotation or a tilt, in place; a third of those that are known throughout
-    keep on turning about their root, by up to a revolution a second."""
+    """Turn a clip about its first root by a random rotation or a tilt, in place.
+
+    A third of the clips without unknown joints keep turning about their root, by up to one revolution per second.
+    """
     axis = rng.standard_normal(3) * rng.choice([(1.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
     axis /= np.linalg.norm(axis)
     turns, pivot = Rotation.from_rotvec(rng.uniform(0, np.pi) * axis), np.nan_to_num(truth[:1, :1])

@@ -1,4 +1,4 @@
-"""UI-PRMD: a Kinect and a Vicon system on the same movements, the one source of real noise with its truth.
+"""UI-PRMD: a Kinect and a Vicon system on the same movements, our only source of real noise with ground truth.
 
 Vakanski et al. 2018, "A data set of human body movements for physical rehabilitation exercises", Data 3(1):2.
 """
@@ -26,15 +26,15 @@ _MISSING = -32768
 
 @dataclass(frozen=True)
 class KinectPair:
-    """One repetition of a movement, seen by both systems at the same instants.
+    """One repetition of a movement, observed by both systems at the same times.
 
-    They agree in time but not in space: align them with one rotation and translation a clip.
+    They agree in time but not in space: align them with one rotation and translation per clip.
 
     Attributes:
-        name: as in the file, such as ``m01_s01_e01``; ``_inc``: done wrongly on purpose.
+        name: name in the file, such as ``m01_s01_e01``; with ``_inc``, the movement is deliberately incorrect.
         subject: ``s01`` to ``s08``.
         movement: ``m01`` to ``m10``.
-        fps: frames a second.
+        fps: frames per second.
         kinect: (T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y.
         vicon: (T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost.
         markers: (T, 39, 3) metres, the Plug-in-Gait markers, z up; NaN where lost.
