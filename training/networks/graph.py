@@ -1,4 +1,4 @@
-"""Graphs whose nodes mix by learned adjacency: layers of HG-VAE, and the completion and fault networks beside it."""
+"""Graph layers with learned adjacency, and the completion and fault networks that accompany HG-VAE."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from steadypose.prior.models.weights import weights_path
 class GraphLinear(nn.Module):
     """``S A W + b``: graphs (n_in, B, f_in) to (n_out, B, f_out), equation 4 without its activation.
 
-    Nodes come first inside the model, so that either product is one of two matrices, however large the batch.
-    ``nodes_in == nodes_out`` stands for the same nodes: then S starts near the identity.
+    Nodes are the first dimension inside the model, so that each product is one of two matrices for any batch size.
+    ``nodes_in == nodes_out`` means the same nodes; S then starts near the identity.
     """
 
     def __init__(self, nodes_in: int, nodes_out: int, features_in: int, features_out: int) -> None:
@@ -43,7 +43,7 @@ class GraphLinear(nn.Module):
 
     def forward(self, graph: Tensor) -> Tensor:
         """(n_in, B, f_in) to (n_out, B, f_out)."""
-        if len(self.bias) < len(graph):  # the cheaper order
+        if len(self.bias) < len(graph):  # the order with fewer operations
             return self._mix(graph) @ self.weight + self.bias[:, None]
         return self._mix(graph @ self.weight) + self.bias[:, None]
 
@@ -52,10 +52,10 @@ class GraphLinear(nn.Module):
 
 
 class GraphBlock(nn.Module):
-    """Two graph convolutional layers beside a residual connection (equation 5).
+    """Two graph convolutional layers with a residual connection (equation 5).
 
     The learned weight, initially 0, multiplies the layers' branch, as in Bachlechner et al. (2020) and the official
-    code; the paper's formula puts it on the residual.
+    code. The paper's formula applies it to the residual.
     """
 
     def __init__(self, nodes: int, features: int) -> None:
@@ -70,18 +70,19 @@ class GraphBlock(nn.Module):
 
 
 class CompletionNet(nn.Module):
-    """Fills in unobserved joints in one pass, before HG-VAE encodes a window: corrections of the interpolated joints of
-    windows of ``frames``, with their variance.
+    """Imputes unobserved joints in one pass, before HG-VAE encodes a window.
 
-    HG-VAE's own encoder learns this badly: a node is one coordinate of one joint, all nodes share their weights, and
-    the likelihood of joints observed to the millimetre outweighs that of hidden ones, off by decimetres. Here a node is
-    a patch of the window's time and its features are the whole body, so that a knee follows from hip, ankle and the
-    other leg.
+    It predicts corrections of the interpolated joints of windows of ``frames``, with their variance.
 
-    A limb that rests mostly goes on resting: then the interpolation relative to its parent
-    (`prior.models.hgvae.features`) is right to the millimetre, and no network is. So the network's correction is fused
-    with that interpolation, each weighted by its inverse variance; the interpolation's variance grows with the time
-    from an observation and with how much this joint of this person has moved while it was observed.
+    HG-VAE's own encoder learns this badly. Its node is one coordinate of one joint, all nodes share their weights, and
+    the likelihood of joints observed to the millimetre outweighs that of hidden joints with errors of decimetres. Here,
+    a node is a patch of the window in time and its features are the whole body, so a knee follows from hip, ankle and
+    the other leg.
+
+    A resting limb mostly stays at rest. The interpolation relative to its parent (`prior.models.hgvae.features`) is
+    then accurate to the millimetre, which no network is. The network's correction is therefore fused with that
+    interpolation by inverse variances. The interpolation's variance grows with the time from an observation, and with
+    how much this joint of this person moved while it was observed.
     """
 
     def __init__(self, frames: int, config: CompletionConfig) -> None:
@@ -94,22 +95,22 @@ class CompletionNet(nn.Module):
         self.blocks = nn.Sequential(*(GraphBlock(nodes, features) for _ in range(config.blocks)))
         self.write = GraphLinear(nodes, nodes, features, (JOINT_NODES + JOINTS) * config.patch)
         with torch.no_grad():
-            self.write.weight.mul_(0.1)  # begins near the interpolation
+            self.write.weight.mul_(0.1)  # start near the interpolation
 
     def forward(self, nodes: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Correction (B, 66, T) and log-variance of the corrected joint (B, 22, T), in units of `SCALE`.
+        """Return correction (B, 66, T) and log-variance of the corrected joint (B, 22, T), in units of `SCALE`.
 
         Args:
-            nodes: (B, T / patch, inputs), as of `Features`.
-            line_variance: (B, 22, T) of the interpolation, `Features.line_variance`.
+            nodes: (B, T / patch, inputs), see `Features`.
+            line_variance: (B, 22, T) variance of the interpolation, `Features.line_variance`.
         """
         written = self.write(self.blocks(F.gelu(self.read(nodes.transpose(0, 1))))).transpose(0, 1)
         return self.fuse(written, line_variance)
 
     def fuse(self, written: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
-        """`forward` from the last layer's output ``written`` (B, T / patch, 88 patch).
+        """Compute `forward` from the last layer's output ``written`` (B, T / patch, 88 patch).
 
-        Network and interpolation are fused as normal distributions, by their product.
+        Network and interpolation are fused as the product of normal distributions.
         """
         correction, log_var = written.split([JOINT_NODES * self.config.patch, JOINTS * self.config.patch], dim=-1)
         log_var = (_by_track(log_var, JOINTS) + FIRST_LOG_VAR).clamp(*LOG_VAR_RANGE)
@@ -122,9 +123,9 @@ class CompletionNet(nn.Module):
     def complete(
         self, deviations: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float
     ) -> tuple[Tensor, Tensor]:
-        """Windows (B, 66, T) with unobserved entries completed, and their log-variance by joint (B, 22, T).
+        """Complete unobserved entries; returns windows (B, 66, T), and log-variance by joint (B, 22, T).
 
-        The arguments are those of `completion_features`.
+        Arguments are as in `completion_features`.
         """
         features = completion_features(deviations.numpy(), observed.numpy(), bias_sigma, self.config.patch)
         correction, log_var = self(torch.from_numpy(features.nodes), torch.from_numpy(features.line_variance()))
@@ -134,7 +135,7 @@ class CompletionNet(nn.Module):
 def certainty_of(observed: Tensor, log_var: Tensor) -> Tensor:
     """(B, 66, T) certainty of a completed window's entries, for HG-VAE's encoder.
 
-    s² / (s² + variance) where completed, with s = `HALF_CERTAIN_SIGMA`; 1 where observed.
+    It is s² / (s² + variance) where completed, with s = `HALF_CERTAIN_SIGMA`, and 1 where observed.
 
     Args:
         observed: (B, 66, T) more than 0 where observed.
@@ -150,12 +151,12 @@ def _by_track(nodes: Tensor, tracks: int) -> Tensor:
 
 
 class FaultNet(nn.Module):
-    """Log-odds that a joint's error is larger than the sensor's noise explains.
+    """Predicts the log odds that a joint's error is larger than the sensor's noise explains.
 
-    A window's likelihood under a generative model distinguishes noise from motion, but not a frozen hand from one that
-    rests, and takes a dance for a fault. The most powerful test between two hypotheses is the ratio of their
-    likelihoods (Neyman and Pearson), which is what a classifier learns: this one reads the observations and HG-VAE's
-    reconstruction with its deviation, and is trained on clean motion and on motion with trackers' faults
+    The likelihood of a window under a generative model distinguishes noise from motion. It does not distinguish a
+    frozen hand from a resting one, and takes a dance for a fault. The most powerful test between two hypotheses is
+    their likelihood ratio (Neyman and Pearson), which a classifier learns. This one reads the observations and HG-VAE's
+    reconstruction with its deviation. It is trained on clean motion and on motion with tracking faults
     (`training.recipes.hgvae_faults`).
     """
 

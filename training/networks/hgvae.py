@@ -1,14 +1,14 @@
 """HG-VAE: a hierarchical graph-convolutional VAE over windows of joint tracks ("Hierarchical Graph-Convolutional
 Variational Autoencoding for Generative Modelling of Human Motion", sections 4 and 5, appendix A).
 
-A node is one coordinate's track of one joint. Its features are the track's cosine transform; graph convolutions with
-learned adjacency mix nodes, contract them to fewer on the way up and expand them on the way down. The decoder keeps a
+A node is the track of one coordinate of one joint. Its features are the track's cosine transform. Graph convolutions
+with learned adjacency mix nodes, reduce their number on the way up and expand it on the way down. The decoder keeps a
 deterministic stream of all nodes, to which every stochastic level adds its latent, from the single top node down to one
 latent for each track.
 
-Beyond the paper: the encoder also reads the certainty of each entry, and entries that were not observed are filled in
-by the completion network (`training.networks.graph`), so that one pass completes a window; and the cosine
-transform may be truncated to its lowest coefficients, which makes the live model small.
+There are two additions to the paper. The encoder also reads the certainty of each entry, and the completion network
+(`training.networks.graph`) imputes unobserved entries, so that one pass completes a window. The cosine transform may be
+truncated to its lowest coefficients, which makes the live model small.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from steadypose.prior.models.hgvae.config import JOINT_NODES, TRACK_LOG_VAR, HGV
 from steadypose.training.networks.graph import CompletionNet, GraphBlock, GraphLinear, certainty_of
 
 INITIAL_LATENT_GAIN, INITIAL_POSTERIOR_LOG_VAR = 0.25, -4.0
-"""Initialisation: the factor on what a level adds to the stream, and the bias of the posteriors' log-variance"""
+"""Initial factor on a level's contribution to the stream, and initial bias of the posteriors' log-variance."""
 
 
 def dct_matrix(frames: int) -> Tensor:
@@ -50,7 +50,7 @@ class Gaussian(NamedTuple):
     log_var: Tensor
 
     def sample(self, spread: Tensor | float = 1.0) -> Tensor:
-        """By the reparametrisation trick, with ``spread`` times the standard deviation."""
+        """Draw a sample by the reparametrisation trick, with ``spread`` times the standard deviation."""
         return self.mean + spread * torch.randn_like(self.mean) * (0.5 * self.log_var).exp()
 
     def log_density(self, value: Tensor) -> Tensor:
@@ -65,11 +65,11 @@ class Gaussian(NamedTuple):
 
 
 class HGVAEOutput(NamedTuple):
-    """What one pass through the model returns.
+    """Output of one pass through the model.
 
     Attributes:
         tracks: p(x | z), mean and log-variance (B, N, T), in units of `SCALE`.
-        kl: (B, L) KL(q || p) of each level, top first; 0 where a level is turned off.
+        kl: (B, L) KL(q || p) of each level, top first; 0 if a level is off.
         log_prior: (B, L) log p(m | above) at the posterior's means m, the terms of the score of section 7.
         top: (B, latent) the top level's posterior mean.
     """
@@ -118,12 +118,12 @@ class HGVAE(nn.Module):
 
     @torch.no_grad()
     def completed(self, x: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
-        """(B, N, T) windows whose unobserved entries are completed, and the certainty (B, N, T) of each entry.
+        """Complete unobserved entries; returns windows (B, N, T) and the certainty (B, N, T) of each entry.
 
         Args:
             x: (B, N, T) tracks; unobserved entries hold the interpolation of `features.to_tracks`.
             observed: (B, N, T) 1 where observed, else 0.
-            bias_sigma: (B,) metres along an axis, of the sensor's bias.
+            bias_sigma: (B,) metres along an axis, the sensor's bias.
         """
         if self.completion is None:
             return x, observed
@@ -137,9 +137,9 @@ class HGVAE(nn.Module):
 
         Args:
             x: (B, N, T) tracks, complete.
-            certainty: (B, N, T) of each entry, 0 to 1: 1 where observed; see `completion.certainty_of`.
-            spread: (B, 1) the share of the posterior's standard deviation with which latents are drawn: 1 to draw
-                them, 0 or None to take the means.
+            certainty: (B, N, T) certainty of each entry, 0 to 1; 1 where observed (see `completion.certainty_of`).
+            spread: (B, 1) share of the posterior's standard deviation with which latents are drawn: 1 to draw them, 0
+                or None for the means.
             action: (B, actions) one-hot, for a model with actions.
         """
         read = torch.cat([x @ self.dct.T, certainty], dim=-1).transpose(0, 1)
@@ -172,13 +172,13 @@ class HGVAE(nn.Module):
     def generate(
         self, count: int, *, random_levels: int | None = None, top: Tensor | None = None, action: Tensor | None = None
     ) -> Gaussian:
-        """Tracks (count, N, T) decoded from the prior.
+        """Decode tracks (count, N, T) from the prior.
 
         Args:
-            count: how many.
-            random_levels: latents of so many levels, from the top, are drawn; those below are their prior's means
-                (figure 6). None: all are drawn.
-            top: (count, latent) the top latent, if it is given; counts as drawn.
+            count: number of samples.
+            random_levels: number of levels, from the top, whose latents are drawn; those below are their prior's means
+                (figure 6). None draws all.
+            top: (count, latent) the top latent, if given; counts as drawn.
             action: (count, actions) one-hot, for a model with actions.
         """
         stream = self.start[:, None].expand(-1, count, -1)
@@ -209,7 +209,7 @@ class DecoderLevel(nn.Module):
             self.prior_head = nn.Linear(features, 2 * level.latent)
         self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
         self.block = GraphBlock(nodes, features)
-        with torch.no_grad():  # little noise at first: sampled at every level, it would bury the signal
+        with torch.no_grad():  # little noise at first: sampled at every level, noise would hide the signal
             self.expand.weight.mul_(INITIAL_LATENT_GAIN)
             self.posterior_head.bias[level.latent :] += INITIAL_POSTERIOR_LOG_VAR
 
@@ -226,7 +226,7 @@ class DecoderLevel(nn.Module):
         return _heads(self.posterior_head(self.posterior_block(joined)))
 
     def add(self, stream: Tensor, z: Tensor, action: Tensor | None) -> Tensor:
-        """The stream with this level's latent added."""
+        """Return the stream with this level's latent added."""
         if self.extra:
             if action is None:
                 raise ValueError(f"expected an action, one-hot (B, {self.extra})")

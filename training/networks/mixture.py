@@ -1,17 +1,17 @@
-"""The network of the mixture: weights of a bank of filters, for every joint, from features of the whole body.
+"""The network of the mixture: predicts weights of a bank of filters for every joint, from features of the whole body.
 
-A mixture of experts (Jacobs et al. 1991) over linear filters. A layer shared by all joints encodes each joint's
-features, a second one the whole body's, and each joint's output is computed from both. The estimate is
+It is a mixture of experts (Jacobs et al. 1991) over linear filters. A layer shared by all joints encodes each joint's
+features, a second layer encodes the whole body's, and each joint's output is computed from both. The estimate is
 
     sum of w_m x_m  +  (1 - w_raw) (sum of b_m x_m + scale r),   w >= 0, sum of w = 1, sum of b = 0, b and r bounded
 
-``x`` being the experts' positions. The second term extrapolates beyond filters that lag, and corrects a joint from the
-context of the whole body, by an amount bounded by the estimated noise ``scale``; it vanishes where the raw joint has
-all the weight, so that a perfect input stays unchanged. A share of the way from there to the multiple-model estimate is
-added, as far as the noise is white (`prior.models.mixture.whiteness`).
+where ``x`` are the experts' positions. The second term extrapolates beyond filters that lag, and corrects a joint from
+the context of the whole body. It is bounded by the estimated noise ``scale``, and vanishes where the raw joint has all
+the weight, so that a noise-free input stays unchanged. As far as the noise is white, the estimate is moved towards the
+multiple-model estimate (`prior.models.mixture.whiteness`).
 
-Outputs are smoothed over time by gates that the network computes (as in gated recurrent units, Cho et al. 2014):
-weights that fluctuate would add noise of their own.
+The network computes gates that smooth its outputs over time (as in gated recurrent units, Cho et al. 2014), because
+fluctuating weights would add noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from steadypose.prior.timing.rate import FPS
 JOINTS = 22
 
 FIRST_GATE = -4.0
-"""Initial bias of the gates: next to no weight on the previous output."""
+"""Initial bias of the gates, which gives almost no weight to the previous output."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ class MixtureConfig:
     """Layer widths.
 
     Attributes:
-        own: features of each joint.
-        body: features of the whole body.
-        told: features of the body passed to each joint.
-        head: features of the layers that compute a joint's output.
+        own: number of features of each joint.
+        body: number of features of the whole body.
+        told: number of the body's features passed to each joint.
+        head: width of the layers that compute a joint's output.
     """
 
     own: int = 32
@@ -60,9 +60,9 @@ class MixtureConfig:
 
 
 class Memory(nn.Module):
-    """Running means of features, each with a learned time constant: a diagonal linear recurrence, which is stable.
+    """Running means of features with learned time constants: a stable, diagonal linear recurrence.
 
-    They are normalised from the first frame on: the initial state has no weight.
+    They are normalised from the first frame on, so the initial state has no weight.
     """
 
     def __init__(self, features: int) -> None:
@@ -71,7 +71,7 @@ class Memory(nn.Module):
         self.decay = nn.Parameter(torch.logit(1.0 - 1.0 / frames))
 
     def forward(self, values: Tensor, present: Tensor) -> Tensor:
-        """Means (C, T, ..., F) of values up to each frame; frames that are not ``present`` (C, T) do not count."""
+        """Return means (C, T, ..., F) of values up to each frame, without frames that are not ``present`` (C, T)."""
         inner = (1,) * (values.ndim - 3)
         kept = torch.where(present[..., None], torch.sigmoid(self.decay), 1.0)
         kept = kept.reshape(*present.shape, *inner, -1)
@@ -80,7 +80,7 @@ class Memory(nn.Module):
 
 
 def _faded(kept: Tensor, added: Tensor) -> Tensor:
-    """The recurrence y[t] = kept[t] y[t - 1] + added[t], of (C, T, ...) from y[-1] = 0."""
+    """Compute the recurrence y[t] = kept[t] y[t - 1] + added[t] over (C, T, ...), with y[-1] = 0."""
     total, out = torch.zeros_like(added[:, 0]), []
     for keep, new in zip(kept.unbind(1), added.unbind(1), strict=True):
         total = torch.addcmul(new, keep, total)
@@ -89,7 +89,7 @@ def _faded(kept: Tensor, added: Tensor) -> Tensor:
 
 
 class MixtureNet(nn.Module):
-    """From features of the joints of a body, frame by frame, to weights, corrections and standard deviations."""
+    """Maps features of a body's joints, frame by frame, to weights, corrections and standard deviations."""
 
     def __init__(self, config: MixtureConfig) -> None:
         super().__init__()
@@ -116,8 +116,10 @@ class MixtureNet(nn.Module):
     deviation: Tensor
 
     def forward(self, features: Tensor, present: Tensor) -> Tensor:
-        """(C, T, 22, OUTPUTS) from features (C, T, 22, FEATURES), from a clip's first frame on, and whether a body is
-        ``present`` (C, T)."""
+        """Return outputs (C, T, 22, OUTPUTS) from features (C, T, 22, FEATURES) of whole clips.
+
+        ``present`` (C, T) says whether there is a body.
+        """
         written, gates = self.layers(
             features, lambda own: self.own_memory(own, present), lambda body: self.body_memory(body, present)
         )
@@ -127,12 +129,12 @@ class MixtureNet(nn.Module):
     def layers(
         self, features: Tensor, own_memory: Callable[[Tensor], Tensor], body_memory: Callable[[Tensor], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """New outputs (..., 22, OUTPUTS) before gating, and their gates (..., 22, GATES).
+        """Return new outputs (..., 22, OUTPUTS) before gating, and their gates (..., 22, GATES).
 
         Args:
-            features: (..., 22, FEATURES).
-            own_memory: from joints' features (..., 22, own) to their means so far.
-            body_memory: from bodies' features (..., body) to theirs.
+            features: (..., 22, FEATURES) input features.
+            own_memory: maps joints' features (..., 22, own) to their running means.
+            body_memory: maps bodies' features (..., body) to their running means.
         """
         normalised = (features - self.mean) / self.deviation
         own = F.relu(self.read(normalised) + self.joint)
@@ -147,7 +149,7 @@ class MixtureNet(nn.Module):
 
 
 def kept_of(gates: Tensor, before: Tensor) -> Tensor:
-    """Weight (..., 22, OUTPUTS) of the previous frame's outputs; 0 where there is no frame ``before``."""
+    """Weight (..., 22, OUTPUTS) of the previous frame's outputs; 0 if there is no frame ``before``."""
     kept = torch.where(before, torch.sigmoid(gates), 0.0)
     return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
 
@@ -161,19 +163,20 @@ def answer(
     between: Tensor,
     fallback: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
+    """Return positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
 
     In a gap between two observations, the multiple-model estimate is used.
 
     Args:
-        outputs: (..., 22, OUTPUTS) of the network.
-        experts: (..., 22, EXPERTS, 3) metres; this and the following as `features.describe` writes them.
+        outputs: (..., 22, OUTPUTS) outputs of the network.
+        experts: (..., 22, EXPERTS, 3) metres; this and the following are written by `features.describe`.
         heading: (..., 2) cosine and sine of the body's heading.
         scale: (...) metres along an axis, estimated noise.
         gap: (..., 22) frames to the nearest observation of each joint.
         between: (..., 22) metres along an axis, deviation of the multiple-model estimate in gaps between two
             observations; otherwise 0.
-        fallback: (...) share of the multiple-model estimate in what is not the raw joint's (`whiteness.fallback`).
+        fallback: (...) share of the multiple-model estimate in the part that is not the raw joint's
+            (`whiteness.fallback`).
     """
     logits, reach, correction, log_sigma = outputs.split([EXPERTS, EXPERTS, 3, 1], dim=-1)
     weights = logits.softmax(dim=-1)
@@ -186,7 +189,7 @@ def answer(
     moved = torch.stack(
         [cos * moved[..., 0] - sin * moved[..., 1], sin * moved[..., 0] + cos * moved[..., 1], moved[..., 2]], dim=-1
     )
-    # from the joint as it came, so that rounding does not move it
+    # relative to the raw joint, so that rounding does not move it
     came = experts[..., RAW, :]
     places = came + (weights[..., None] * (experts - came[..., None, :])).sum(dim=-2) + moved
     places = places + fallback[..., None, None] * free * (experts[..., MULTIPLE_MODEL, :] - places)

@@ -1,13 +1,12 @@
-"""The completer, a transformer that corrects slerp and lerp between what is known of a motion, and its training:
-``steadypose train completer``.
+"""The completer, a transformer that corrects interpolated motion, and its training: ``steadypose train completer``.
 
-One encoder over the frames of a window, hidden and known alike, as the transformers for in-betweening have it (Duan et
-al. 2022; Qin et al. 2022, "Motion In-betweening via Two-stage Transformers"), whose output is added to an interpolation
-(Oreshkin et al. 2023, "Motion In-betweening via Deep Delta-Interpolator"). Theirs know whole frames or nothing; here
-any joint may be known in any frame, and the network gates cubics, which theirs do without.
+One encoder processes all frames of a window, hidden and known, as in transformers for in-betweening (Duan et al. 2022;
+Qin et al. 2022, "Motion In-betweening via Two-stage Transformers"). Its output is added to an interpolation by slerp
+and lerp (Oreshkin et al. 2023, "Motion In-betweening via Deep Delta-Interpolator"). In these papers, frames are known
+completely or not at all. Here, any joint may be known in any frame, and the network also gates a cubic interpolation.
 
-Windows of true motion lose what `complete` is asked for: all frames between two ends, frames between key frames, parts
-of the body, and combinations of these; the known joints of some have a little noise.
+In training, windows of true motion lose the entries that `complete` is asked for: all frames between two ends, frames
+between key frames, parts of the body, and combinations of these. In some windows, the known joints are slightly noisy.
 """
 
 from __future__ import annotations
@@ -59,11 +58,11 @@ class Completer(nn.Module):
         self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(config.width)
         self.write = nn.Linear(config.width, OUTPUTS)
-        # (22, 4) quaternions, xyzw, local, of the mean pose
+        # (22, 4) local quaternions, xyzw, of the mean pose
         self.register_buffer("usual", torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(22, 1))
         self.usual: Tensor
         with torch.no_grad():
-            self.write.weight.mul_(0.05)  # begins near the line
+            self.write.weight.mul_(0.05)  # start near the line
             self.write.bias.zero_()
             self.write.bias[BENDS:] = 1.0
 
@@ -99,23 +98,23 @@ class _Layer(nn.Module):
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
-"""Frames a step; AdamW's rate at its highest, from where it falls along a cosine."""
+"""Number of steps; frames per step; largest learning rate of AdamW, from which it falls along a cosine."""
 
 GAPS, CONTEXT = (5, 64), (2, 14)
-"""Ranges of the lengths of a gap, and of what is known around it, before and after together, frames."""
+"""Ranges of the length of a gap, and of the known context before and after it together, frames."""
 
 STRIDES, SCALES = (1, 1, 1, 2), (0.85, 1.15)
-"""Frame strides of windows; range of factors on people's sizes."""
+"""Frame strides of windows, and range of factors on people's sizes."""
 
 NOISY, NOISE = 0.3, 0.015
-"""Share of windows whose known joints are noisy, and its largest standard deviation, metres along an axis."""
+"""Share of windows with noisy known joints, and largest standard deviation of the noise along an axis, metres."""
 
 POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
-"""Weights of joints about the root and the root itself, 1/m; global rotation matrices; joints' steps, frames/m."""
+"""Weights of root-relative joints and of the root, 1/m; of global rotation matrices; and of joints' steps, frames/m."""
 
 EASY = 0.05
-"""Error that is added to the interpolation's to divide a window's loss by, so that fast motion does not dominate,
-metres."""
+"""Error added to the interpolation's error in the normalisation of a window's loss, metres. The normalisation keeps
+fast motion from dominating."""
 
 _ARMS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"))
 _LEGS = limbs(("knee", "ankle", "foot"), ("ankle", "foot"))
@@ -127,7 +126,7 @@ _BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
 
 
 def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
-    """Train the completer, of these sizes, on prepared motion; the path of the weights."""
+    """Train the completer with these sizes on prepared motion; returns the path of the weights."""
     train, val = options.motion()
     windows, sizes = SpeedWeightedWindows(train), config or CompleterConfig()
 
@@ -168,7 +167,7 @@ class Truth:
 
     @classmethod
     def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:
-        """These frames (B, T); with ``rng``, half of the windows mirrored and all scaled at random."""
+        """Select frames (B, T); with ``rng``, mirror half of the windows and scale all at random."""
         rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
         if rng is not None:
             half = len(rows) // 2
@@ -182,7 +181,7 @@ class Truth:
         return cls(rotations, root, offsets)
 
     def seen(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
-        """The completer's input where these joints (B, T, 22) are known; with ``rng``, some are noisy."""
+        """Return the completer's input if these joints (B, T, 22) are known; with ``rng``, some are noisy."""
         joints = forward_kinematics(self.rotations, self.offsets[:, None], self.root)[0].double().numpy()
         if rng is not None:
             sigma = rng.uniform(0.0, NOISE, (len(joints), 1, 1, 1)) * (rng.random((len(joints), 1, 1, 1)) < NOISY)
@@ -191,7 +190,7 @@ class Truth:
         return read_window(joints, self.offsets.double().numpy(), usual.double().numpy())
 
     def in_frame_of(self, window: Window) -> tuple[Tensor, Tensor]:
-        """Rotations (B, T, 22, 3, 3) and root (B, T, 3), turned and moved as the window is."""
+        """Return rotations (B, T, 22, 3, 3) and root (B, T, 3) in the frame of the window."""
         turn, origin = torch.from_numpy(window.turn).float(), torch.from_numpy(window.origin).float()
         rotations = self.rotations.clone()
         rotations[:, :, 0] = turn.mT[:, None] @ rotations[:, :, 0]
@@ -199,9 +198,9 @@ class Truth:
 
 
 def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
-    """(count, gap + context, 22) which joints are known, in tasks of completion.
+    """(count, gap + context, 22) which joints are known in random completion tasks.
 
-    By chance 52 % a gap, 10 % key frames, 30 % parts of the body hidden, 8 % both a gap and parts.
+    52 % have a gap, 10 % key frames, 30 % hidden parts of the body, and 8 % both a gap and hidden parts.
     """
     frames = gap + context
     known = np.ones((count, frames, 22), dtype=bool)
@@ -261,7 +260,7 @@ def predict(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
 
 
 def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-    """Absolute errors where something was hidden, weighted by window (`EASY`); and its terms by name."""
+    """Return the absolute errors where joints are hidden, normalised by window (`EASY`), and the terms by name."""
     window = truth.seen(known, model.usual, rng)
     rotations, root = predict(model, window)
     true, true_root = truth.in_frame_of(window)
@@ -290,7 +289,7 @@ def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor
 
 
 PROTOCOL = (10, 1)
-"""Frames known before a gap and after it, in the protocol of LAFAN1 (Harvey et al. 2020)."""
+"""Numbers of known frames before and after a gap, in the protocol of LAFAN1 (Harvey et al. 2020)."""
 
 
 @torch.no_grad()
@@ -315,14 +314,14 @@ def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) 
 
 
 HIDDEN_PARTS = (_ARMS[1], _ARMS[3], _LEGS[0], _LEGS[2], [J["head"], J["neck"]], _BETWEEN.tolist())
-"""What is hidden to see how far off joints are that are never known; by the first in which a joint is."""
+"""Parts that are hidden to measure the errors of joints that are never known; the first part with a joint counts."""
 
 
 @torch.no_grad()
 def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> CompleterConfig:
-    """The configuration with the model's RMS errors along an axis, measured on validation motion.
+    """Return the configuration with the model's RMS errors along an axis, measured on validation motion.
 
-    The time constant, in frames, is the one that best fits the growth of the error from the ends of a gap.
+    The time constant, in frames, is fitted to the growth of the error from the ends of a gap.
     """
     never = np.full(22, np.nan)
     for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
@@ -347,9 +346,7 @@ def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> Comple
 def _errors(
     model: Completer, motion: MotionSet, known: Bools, windows: int, *, squared: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """(T, 22) mean distances of joints from the truth, metres, or their mean squares: of the prediction and the
-    line.
-    """
+    """(T, 22) mean distances of joints from the truth, metres, or their mean squares, of prediction and line."""
     rows = motion.all_windows(len(known), step=5)
     rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
     truth = Truth.of(motion, rows)

@@ -1,12 +1,12 @@
 """The contact network and its training: ``steadypose train contacts``.
 
-HuMoR's decoder predicts of eight joints whether they are in contact, by a label that asks for both: to be low and
-slower than 0.15 m/s. Against force plates that misses a third of a walker's stance, for a foot rolls over its heel and
-its toe. Here each joint has two labels, load and rest (`prior.body.kinematics.label_contacts`), and a recurrent network
-of its own reads joints as a tracker's noise leaves them, with their standard deviations, one pass a frame.
+HuMoR's decoder predicts contact of eight joints; its label requires that a joint is low and slower than 0.15 m/s.
+Compared with force plates, this misses a third of a walker's stance, because a foot rolls over its heel and toe. Here,
+each joint has two labels, load and rest (`prior.body.kinematics.label_contacts`). A separate recurrent network reads
+smoothed joints with their standard deviations, in one pass per frame.
 
-Clips of true motion go through simulated sensors and the smoother that the live node runs, once; then windows of its
-output are drawn, turned, and stripped of what a sensor may not give: the root, the ground, joints.
+Clips of true motion are passed once through simulated sensors and the live node's smoother. Windows of its output are
+then drawn and turned, and lose entries that a sensor may lack: the root, the ground, joints.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from steadypose.training.data.dataset import MotionSet, describe_data
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 OUTPUTS = 2 * len(CONTACT_JOINTS)
-"""Load, then rest, of each joint."""
+"""Number of outputs: load of each joint, then rest of each joint."""
 
 
 @dataclass(frozen=True)
@@ -82,34 +82,34 @@ class ContactNet(nn.Module):
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
-"""Clips a step; the rate at the start."""
+"""Number of steps; clips per step; initial learning rate."""
 
 FRAMES = 90
-"""Of a clip, from its first: the start of a stream is a part of it."""
+"""Length of a clip, frames; it includes the start of a stream."""
 
 CLIPS = {"train": 3072, "val": 384}
-"""Clips of each split that are smoothed."""
+"""Number of smoothed clips of each split."""
 
 SIDE_BY_SIDE = 64
-"""Clips smoothed as the bodies of one stream."""
+"""Number of clips that are smoothed together as bodies of one stream."""
 
 DELAYS = (0, 2, 4, 4, 8)
-"""Frames, of the smoother."""
+"""Delays of the smoother, frames."""
 
 MIN_SPEED = 0.1
-"""m/s: a clip is drawn as often as its feet are fast, and one that stands still as if they were this fast."""
+"""Least speed in the sampling weight of a clip, which is proportional to the speed of its feet, m/s."""
 
 SCALES = (0.8, 1.15)
 """Range of factors on people's sizes."""
 
 SOLE_SD = 0.01
-"""Metres: how far joints lie off where the training motion has them, by rig and shoe, and the ground off its place."""
+"""Standard deviation of offsets of joints, by rig and shoe, and of the ground from the training motion's, metres."""
 
 YAW_SD = math.radians(15.0)
-"""How well the heading is known."""
+"""Standard deviation of the heading's error, radians."""
 
 ROOT_UNSEEN, GROUND_UNKNOWN, FEET_ALONE = 0.25, 0.25, 0.15
-"""Shares of windows: against the root alone; on a ground that nobody knows; of which only the feet are known."""
+"""Shares of windows with joints relative to the root only, with unknown ground, and with only the feet known."""
 
 _HANDS_KNEES_ROOT = [0, *(J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "wrist"))]
 _FEET = slice(2, 6)
@@ -117,7 +117,7 @@ _FEET = slice(2, 6)
 
 @dataclass(frozen=True)
 class Pool:
-    """Clips as the smoother leaves them, (C, T, ...).
+    """Smoothed clips, (C, T, ...).
 
     Attributes:
         positions: (C, T, 22, 3) metres, world, float32.
@@ -135,7 +135,7 @@ class Pool:
 
 
 def smoothed_clips(motion: MotionSet, count: int, seed: int) -> Pool:
-    """``count`` clips, the faster the likelier, as people of several sizes through several sensors."""
+    """Draw ``count`` clips, weighted by speed, and simulate people of several sizes and several sensors."""
     rng = np.random.default_rng(seed)
     starts = motion.all_windows(FRAMES, 5)[:, 0]
     feet = motion.positions[:, [J["left_ankle"], J["right_ankle"]]].numpy()
@@ -222,7 +222,7 @@ def _tensor(values: NDArray[Any]) -> Tensor:
 
 
 def train_contacts(options: TrainingOptions) -> Path:
-    """Train the contact network on prepared motion at several speeds; the path of the weights."""
+    """Train the contact network on prepared motion at several speeds; returns the path of the weights."""
     motion = dict(zip(CLIPS, options.motion(flat=True), strict=True))
     train, val = (_pool(options.path("contacts").parent, motion[split], split, options.seed) for split in CLIPS)
 
@@ -246,7 +246,7 @@ def train_contacts(options: TrainingOptions) -> Path:
 
 
 def _pool(directory: Path, motion: MotionSet, split: str, seed: int) -> Pool:
-    """Smoothed clips of a split, made once."""
+    """Return the smoothed clips of a split, computed once."""
     path = directory / f"clips-{split}.npz"
     if not path.is_file():
         directory.mkdir(parents=True, exist_ok=True)

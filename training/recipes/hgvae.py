@@ -1,9 +1,9 @@
-"""Training of HG-VAE (section 5): the evidence lower bound, and completion of windows seen in part.
+"""Training of HG-VAE (section 5): the evidence lower bound, and completion of partly observed windows.
 
-Half of each batch is the paper's: clean windows, every entry observed, latents sampled, KL warmed up. The other half
-simulates a camera: entries are hidden, and completed by the completion network, which is trained first
-(`completion_recipe`); observed entries are noisy or faulty; and the loss is the negative log-likelihood of the clean
-window at the posterior means. One pass then denoises and completes a window, with a standard deviation.
+Half of each batch follows the paper: clean windows with every entry observed, sampled latents, and KL warm-up. The
+other half simulates a camera. Entries are hidden and completed by the completion network, which is trained first
+(`completion_recipe`). Observed entries are noisy or faulty. The loss is the negative log-likelihood of the clean window
+at the posterior means. One pass then denoises and completes a window, with a standard deviation.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
 
 ITERATIONS, COMPLETION_BATCH = 9_000, 128
-"""Steps of the model that runs live; windows a step of its completion network."""
+"""Number of steps of the live model; windows per step of its completion network."""
 
 FAULTS = (stands_still, exchanged, displaced)
 FAULT_SHARE = 0.3
-"""Kinds of tracking faults among the observed joints, and the share of windows with one"""
+"""Kinds of tracking faults among the observed joints, and share of windows with one."""
 
 BONE_SIGMA, TURN_SIGMA = 0.05, 0.2
-"""Augmentation by `vary_builds`: deviation of the logarithm of bone lengths, and of rotations in radians; there are
-only 22 people to train on."""
+"""Standard deviations of the augmentation `vary_builds`: of the logarithm of bone lengths, and of rotations, radians.
+There are only 22 people to train on."""
 
 
 def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[CompletionNet]:
-    """Of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries.
+    """Return the recipe of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries.
 
-    Each is weighted by its stated standard deviation (Seitzer et al., "On the Pitfalls of Heteroscedastic Uncertainty
-    Estimation", ICLR 2022, beta = 0.5): without the weight, entries of small deviation would dominate the gradient.
+    Each entry is weighted by its predicted standard deviation (Seitzer et al., "On the Pitfalls of Heteroscedastic
+    Uncertainty Estimation", ICLR 2022, beta = 0.5). Otherwise, entries of small deviation would dominate the gradient.
 
     Args:
         model: an HG-VAE with a completion network; its ``mean`` is set.
@@ -108,10 +108,10 @@ def _network(model: HGVAE) -> CompletionNet:
 
 @torch.no_grad()
 def evaluate_completion(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
-    """On unseen people: RMS error along an axis of joints hidden as in training, and of 1 and 4 in clean windows.
+    """Evaluate on unseen people: RMS error along an axis of joints hidden as in training, and of 1 and 4 hidden joints.
 
     Returns:
-        ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the former's error over its deviation.
+        ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the error-to-sigma ratio of the first.
     """
     rng = np.random.default_rng(1)
     clean, sizes = val.draw(windows, model.config.frames, rng)
@@ -145,20 +145,20 @@ MODELS: dict[str, HGVAEConfig] = {
         completion=CompletionConfig(),
     ),
 }
-"""``hgvae`` runs live on a robot's CPU; ``hgvae-wide`` has the paper's size, for recordings."""
+"""Sizes of the models: ``hgvae`` runs live on a robot's CPU; ``hgvae-wide`` has the paper's size, for recordings."""
 
 KL_START = 0.001
-"""beta at the start (section 5)."""
+"""Initial beta (section 5)."""
 WARM_UP = 0.2
-"""Share of the training over which beta rises to 1 (the paper: 200 of 5,000 epochs, of a much longer training)."""
+"""Share of the training over which beta rises to 1 (paper: 200 of 5,000 epochs of a much longer training)."""
 CLIP_ENTRY = 100.0
-"""Maximum norm of the gradient (section 5) per root of the entries of a window: the loss is summed over these"""
+"""Maximum norm of the gradient (section 5) per square root of a window's entries, over which the loss is summed."""
 
 
 def train_hgvae(options: TrainingOptions) -> Path:
     """Train HG-VAE on prepared motion, after its completion network and before its fault network.
 
-    From ``options.start`` the learning rate is half, and the fault network goes on from the one beside those weights.
+    With ``options.start``, the learning rate is halved, and the fault network starts from the one beside those weights.
 
     Returns:
         The path of the weights.
@@ -210,7 +210,7 @@ def recipe_of(name: str, train: Windows, val: Windows, batch: int, rate: float) 
         drawn = model(both.x, both.certainty, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
-        # weighted by the stated deviation: see `completion_recipe`
+        # weighted by the predicted deviation, see `completion_recipe`
         density[half:] = density[half:] * (stated / stated.mean())
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / count
@@ -226,19 +226,19 @@ def recipe_of(name: str, train: Windows, val: Windows, batch: int, rate: float) 
 
 
 def evidence(drawn: HGVAEOutput, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The two terms of equation 1, nats a window (B,): log p(x | z), x in metres, and the KL divergence."""
+    """Return the two terms of equation 1, nats per window (B,): log p(x | z), x in metres, and the KL divergence."""
     entries = target[0].numel()
     return drawn.tracks.log_density(target).flatten(1).sum(dim=1) - entries * math.log(SCALE), drawn.kl.sum(dim=1)
 
 
 @torch.no_grad()
 def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
-    """On unseen people: evidence lower bound, reconstruction error, and error of completed entries.
+    """Evaluate on unseen people: evidence lower bound, reconstruction error, and error of completed entries.
 
     Returns:
-        ``ELBO`` and its ``log p(x|z)``, nats an entry; ``val mm``, the mean joint error of whole windows; ``hidden
-        mm``, that of joints hidden as in training, and ``guess mm``, that of the completion network alone; ``hidden
-        found/stated``, RMS error over stated deviation of the former.
+        ``ELBO`` and its ``log p(x|z)``, nats per entry; ``val mm``, the mean joint error of whole windows; ``hidden
+        mm``, that of joints hidden as in training; ``guess mm``, that of the completion network alone; ``hidden
+        found/stated``, the error-to-sigma ratio of the hidden joints.
     """
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)

@@ -1,6 +1,6 @@
-"""What the score stage is made of: the fault network, and what clean motion of people it has not seen scores.
+"""Training of the score stage: the fault network, and the calibration of its scores on clean motion of unseen people.
 
-Everything is as the live node sees it: a sensor of a given error, half of it slow, and some joints missing.
+Inputs are as in the live node: a sensor with a given error, half of it bias, and some joints missing.
 """
 
 from __future__ import annotations
@@ -59,36 +59,36 @@ from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.weights import started
 
 WINDOWS = 2000
-"""for each error, number of joints missing and pace, of which the rarest rate leaves a few"""
+"""Number of windows for each sensor error, number of missing joints and pace; a few exceed the lowest rate."""
 
 FASTER, MAX_DRAWS = (1, 2, 3), 12
-"""strides of the windows among which each pace is looked for, and how often as many are drawn: what is fast is rare"""
+"""Strides of the windows from which each pace is selected, and largest number of draws, as fast windows are rare."""
 
 BATCH = 64
-"""windows in each step of the fault network's optimiser"""
+"""Number of windows per step of the fault network."""
 
 MIN_FAULT = 0.015
-"""Metres along an axis, over the frames that are scored: a joint less off than that, or than the sensor's own error, is
-no fault worth the name, and one less off than a fifth of it is none."""
+"""Least error of a faulty joint along an axis over the scored frames, metres; it must also exceed the sensor's own
+error. Joints with less than a fifth of it are not faulty; those between are ambiguous."""
 
 FAULTS = (stands_still, exchanged, sides_exchanged, displaced, of_another_person, other_bones, noisy, jumps)
 BONE_SIGMA, TURN_SIGMA = 0.05, 0.1
-"""By how much each bone of a window is longer or shorter, and turned, radians (`vary_builds`): how
-somebody is built or holds a limb is no fault."""
+"""Standard deviations of the augmentation `vary_builds`: of the logarithm of bone lengths, and (at most) of rotations,
+radians. A person's build and posture are no faults."""
 
 FAULT_SHARE = 0.6
-"""share of the windows that has a fault"""
+"""Share of the windows that have a fault."""
 REPEATED = 0.15
-"""share of the windows in which a tracker repeats its last output for some joints"""
+"""Share of the windows in which a tracker repeats its last output for some joints."""
 
 
 def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
-    """Train the fault network of an HG-VAE, and measure its scale on validation motion; both go beside its weights.
+    """Train the fault network of an HG-VAE, calibrate it on validation motion, and write both beside HG-VAE's weights.
 
     Args:
-        path: of HG-VAE's weights, ``.safetensors``.
-        iterations: optimiser steps.
-        options: as HG-VAE was trained with, but to start from weights of a fault network.
+        path: path of HG-VAE's weights, ``.safetensors``.
+        iterations: number of optimiser steps.
+        options: HG-VAE's training options, except that ``start`` names weights of a fault network.
     """
     weights, seed = options.weights, options.seed
     model = load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
@@ -122,7 +122,7 @@ def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None
 
 
 def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rng) -> Tensor:
-    """Binary cross-entropy over the joints seen of which it is clear whether they are off."""
+    """Binary cross-entropy over the observed joints that are clearly faulty or clearly not."""
     clean, sizes = windows.draw(count, model.config.frames, rng, STRIDES)
     clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
     sigma = np.exp(rng.uniform(np.log(SENSOR_SIGMAS[0]), np.log(SENSOR_SIGMAS[-1]), count))
@@ -151,8 +151,10 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rn
 def _reconstruct(
     model: HGVAE, seen: Floats, sizes: Floats, bias_sigma: Floats | float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Tracks of windows (B, T, 22, 3) of bodies of sizes (B,), what HG-VAE makes of them and how sure it is, all
-    (B, 66, T) metres, and what was observed; ``bias_sigma`` (B,) metres, the errors of the sensor that last."""
+    """Reconstruct windows (B, T, 22, 3) of bodies of sizes (B,), given the sensor's bias ``bias_sigma`` (B,) metres.
+
+    Returns the tracks, HG-VAE's mean and standard deviation, all (B, 66, T) metres, and the observed mask.
+    """
     tracks = to_tracks(seen, sizes)
     observed = torch.from_numpy(tracks.observed).float()
     found = model(*model.completed(standardise(model, tracks.x), observed, bias_sigma)).tracks
@@ -161,11 +163,11 @@ def _reconstruct(
 
 
 class Scored(NamedTuple):
-    """Windows, as `score_windows` has them.
+    """Scores of windows, from `score_windows`.
 
     Attributes:
-        odds: (B, 22) of `joint_odds`.
-        pace: (B,) m/s, of `pace`.
+        odds: (B, 22) log odds from `joint_odds`.
+        pace: (B,) m/s, from `pace`.
     """
 
     odds: Floats
@@ -190,7 +192,7 @@ def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, 
 
 
 def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
-    """The scale, from about ``count`` windows for each condition; where there is none so fast, from all."""
+    """Calibrate with about ``count`` windows for each condition; if none is fast enough, with all windows."""
     rng = np.random.default_rng(seed)
     conditions = [(m, s) for m in range(len(MISSING)) for s in range(len(SENSOR_SIGMAS))]
     quantiles = np.zeros((len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES)))
@@ -208,7 +210,7 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
 
 
 def _at_paces(windows: Windows, frames: int, count: int, rng: Rng) -> tuple[Floats, Floats]:
-    """Windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
+    """Return windows (B, T, 22, 3), up to ``count`` of each class of `PACES`, and body sizes."""
     kept: list[tuple[Floats, Floats]] = []
     wanted = np.full(len(PACES), count)
     for _ in range(MAX_DRAWS):

@@ -32,51 +32,52 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 VAE = TypeVar("VAE", bound=MotionVAE)
 
 JOINT_WEIGHT = 10.0
-"""lambda of equation 5."""
+"""Weight lambda of equation 5."""
 
 KL_WEIGHT = 0.003
-"""beta of equation 3; belongs to `Posterior.kl`'s reduction and to losses that are means."""
+"""Weight beta of equation 3; it matches `Posterior.kl`'s reduction and losses that are means."""
 
 GLOBAL_FIRST = 0.08
-"""Share of the training in which z_l is detached, so that z_g is not left idle (official: 20,000 of 250,000)."""
+"""Share of the training in which z_l is detached, so that z_g is used (official: 20,000 of 250,000 steps)."""
 
 LOCAL_WARM_UP = 0.4
-"""Share of the training over which beta of z_l then rises from 0. At once, z_l collapses to its prior and the error
-of reconstruction rises by a tenth: by then the decoder has learnt to ignore it (benchmarks/NOTEBOOK.md)."""
+"""Share of the training over which beta of z_l then rises from 0. With the full beta at once, z_l collapses to its
+prior and the reconstruction error rises by a tenth, because the decoder has learnt to ignore z_l
+(benchmarks/NOTEBOOK.md)."""
 
-# The paper varies the frame rate; prepared motion has 30 Hz, so its thirds and halves are left. Half the windows keep
-# the rate at which the live node runs.
+# The paper varies the frame rate. Prepared motion has 30 Hz, so its halves and thirds are available. Half of the
+# windows keep the live node's rate.
 STRIDES = (1, 1, 1, 2, 2, 3)
 TILT_SD = math.radians(3.0)
 
 _LIMBS = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 
 ABOUT_MEAN_KL_WEIGHT = 1e-5
-"""beta of a model about the mean pose, whose deviations are small: at the paper's beta the KL divergence outweighs what
-the latents gain, and they collapse to the prior."""
+"""Weight beta of a model about the mean pose. Its deviations are small, so with the paper's beta, the KL divergence
+outweighs the latents' gain and they collapse to the prior."""
 
 NOISY, NOISE, HELD = 0.5, 0.03, 0.25
-"""For a model about the mean pose: share of windows with noise; its largest deviation, metres along an axis, any part
-of the variance being slow; and share of these windows with a frozen limb."""
+"""Corruption for a model about the mean pose: share of windows with noise; largest standard deviation of the noise
+along an axis, metres, with a random share of bias; and share of these windows with a frozen limb."""
 
 LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=24, global_latent=24, about_mean=True)
-"""Windows of 64 frames for `prior.fit.optimise`: the official sizes, but for a kernel of half as many frames, twice
-as many dimensions of z_l, which fast motion takes, and about the mean pose."""
+"""Sizes for windows of 64 frames, used by `prior.fit.optimise`. They are the official sizes, except for half the
+kernel, twice the dimensions of z_l (for fast motion), and encoding about the mean pose."""
 
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """How a VAE of windows is trained.
+    """Hyperparameters of a VAE of windows.
 
     Attributes:
-        iterations: optimiser steps.
-        batch: windows a step.
-        learning_rate: of Adam at the start; it falls to a third twice.
-        strides: frame strides of windows, drawn with equal probability for each entry.
+        iterations: number of optimiser steps.
+        batch: windows per step.
+        learning_rate: initial learning rate of Adam; it falls to a third twice.
+        strides: frame strides of windows; each entry has the same probability.
         kl_weight: beta.
         joint_weight: lambda.
-        denoise: whether its input is corrupted by noise and occlusion, the target being the clean window.
-        speed_weighted: whether windows are speed-weighted: fast motion is drawn more often, and large sources less.
+        denoise: whether the input is corrupted by noise and occlusion, with the clean window as the target.
+        speed_weighted: whether windows are speed-weighted: fast motion is drawn more often, large sources less.
     """
 
     iterations: int
@@ -90,8 +91,8 @@ class Hyperparameters:
 
 
 SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=200.0, denoise=True)
-"""The official schedule (250,000 steps of 8 windows at 1e-4) folded into fewer, larger steps; the proportions are kept:
-z_l comes in late, the rate falls twice."""
+"""Hyperparameters with the official schedule (250,000 steps of 8 windows at 1e-4) condensed into fewer, larger steps.
+The proportions are kept: z_l enters late, and the learning rate falls twice."""
 
 LONG = Hyperparameters(
     12_000,
@@ -106,13 +107,12 @@ LONG = Hyperparameters(
 
 
 def train_hmvae(options: TrainingOptions) -> Path:
-    """Train HM-VAE on prepared motion; the path of the weights."""
+    """Train HM-VAE on prepared motion; returns the path of the weights."""
     return _train("hmvae", HMVAEConfig(about_mean=True), "window 8 about its mean pose", SHORT, options)
 
 
 def train_long_hmvae(options: TrainingOptions) -> Path:
-    """Train the denoising HM-VAE over windows of 64 frames that `complete --optimise` searches; the path of the
-    weights."""
+    """Train the denoising HM-VAE over windows of 64 frames for `complete --optimise`; returns the weights' path."""
     return _train("hmvae64", LONG_CONFIG, "window 64 about its mean pose", LONG, options)
 
 
@@ -126,7 +126,7 @@ def _train(name: str, config: HMVAEConfig, described: str, used: Hyperparameters
 def recipe_of(
     name: str, network: Callable[[], VAE], train: MotionSet, val: MotionSet, used: Hyperparameters
 ) -> Recipe[VAE]:
-    """Of a VAE of windows, trained as HM-VAE is, with equations 3 and 5 to 8."""
+    """Return the recipe of a VAE of windows, trained like HM-VAE with equations 3 and 5 to 8."""
     windows = SpeedWeightedWindows(train) if used.speed_weighted else train
 
     def loss_of(model: VAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
@@ -146,10 +146,10 @@ def recipe_of(
 
 
 def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """Mirror half of the windows; tilt all a little, since no camera is levelled perfectly.
+    """Mirror half of the windows, and tilt all slightly, because no camera is levelled perfectly.
 
-    The paper turns windows at random in all directions. Here yaw is removed exactly by heading normalisation, and
-    gravity is known: what is left to be robust against is the error of its direction.
+    The paper turns windows at random in all directions. Here, heading normalisation removes yaw exactly, and gravity is
+    known up to a small error of its direction.
     """
     half = len(rotations) // 2
     rotations = torch.cat([mirror_rotations(rotations[:half]), rotations[half:]])
@@ -160,13 +160,13 @@ def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = None) -> Tensor:
-    """Windows (B, T, 22, 3, 3) as they are solved from noisy joints, on bones (B, 22, 3).
+    """Return windows (B, T, 22, 3, 3) solved from noisy joints with bones (B, 22, 3).
 
     Args:
-        rotations: true.
-        offsets: metres.
-        rng: random numbers.
-        noise: metres along an axis, of every window's joints and new in each frame; random if left out.
+        rotations: true rotations.
+        offsets: bones, metres.
+        rng: random generator.
+        noise: metres along an axis, independent noise of all joints in each frame; random if omitted.
     """
     joints = forward_kinematics(rotations, offsets[:, None])[0].double().numpy()
     count, frames = joints.shape[:2]
@@ -189,13 +189,13 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = 
 def _loss(
     model: MotionVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, used: Hyperparameters
 ) -> tuple[Tensor, dict[str, float]]:
-    """Equations 3 and 5 to 8, every term a mean; ``local_weight`` is z_l's share of beta, below 0 it is detached."""
+    """Equations 3 and 5 to 8, each term a mean. ``local_weight`` is z_l's share of beta; below 0, z_l is detached."""
     x = to_6d(rotations)
     given = to_6d(seen)
     posterior = model.encode(given)
     local, deep = posterior.sample()
     local_kl, global_kl = posterior.kl()
-    if local_weight < 0:  # as the official code: its noise still reaches the decoder
+    if local_weight < 0:  # as in the official code, its noise still reaches the decoder
         local, local_kl = local.detach(), local_kl.detach()
     decoded = model.placed(model.decode(local, deep), given)
     matrices = from_6d(decoded)
@@ -212,7 +212,7 @@ def _loss(
 
 @torch.no_grad()
 def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) -> dict[str, float]:
-    """Reconstruction from the posterior's mean on unseen people.
+    """Evaluate the reconstruction from the posterior's mean on unseen people.
 
     Returns:
         ``val MPJPE mm`` over whole windows, root-centred, and ``val centre mm``, of the frame that refinement keeps.
@@ -232,7 +232,7 @@ def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) ->
 
 
 def _noise_left(model: MotionVAE, rotations: Tensor, offsets: Tensor) -> float:
-    """Error of joints in windows with 2 cm of noise, decoded, as a share of what it is as they are solved."""
+    """Return the decoded joints' error in windows with 2 cm of noise, relative to the error before decoding."""
     noisy = corrupt(rotations, offsets, np.random.default_rng(0), noise=0.02)
     decoded = from_6d(model.reconstruct(to_6d(noisy)))
     joints, _ = forward_kinematics(torch.stack([decoded, noisy, rotations]), offsets[:, None])

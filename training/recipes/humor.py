@@ -19,43 +19,43 @@ from steadypose.training.data.dataset import MotionSet, describe_data, mirror_of
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4
-"""Sequences a step; the rate at the start."""
+"""Number of steps; sequences per step; initial learning rate."""
 
 STEPS = 10
-"""Steps of a training sequence."""
+"""Number of steps of a training sequence."""
 
 SCALES = (0.9, 1.1)
 """Range of factors on people's sizes."""
 
 MIN_SPEED = 0.1
-"""m/s, added to the speed of the feet, to which the probability of drawing a sequence is proportional."""
+"""Speed added to the feet's speed in the sampling weight of a sequence, m/s."""
 
 KL_WEIGHT, KL_SHARE = 4e-4, 0.25
-"""As the official code: nats are summed over the latent, all other terms are means. The share of the training in which
-it grows from 0."""
+"""Weight of the KL divergence, as in the official code (summed over the latent; all other terms are means), and share
+of the training over which it grows from 0."""
 
 JOINTS_WEIGHT, ROTATIONS_WEIGHT = 100.0, 10.0
-"""Weights of squared joint errors (m²) and of squared entries of rotation matrices, relative to 1 of velocities
-((m/s)²). Velocities are differences here, 30 times an error of a joint: with the paper's weights of 1, whose decoder
-predicts velocities separately, a rollout would need half a minute to recover from an error; so it needs a third of a
-second."""
+"""Weights of squared joint errors (m²) and of squared entries of rotation matrices, relative to the weight 1 of
+velocities ((m/s)²). The paper's decoder predicts velocities separately; here they are differences, 30 times a joint's
+error. With the paper's weights of 1, a rollout would take half a minute to recover from an error; with these, it takes
+a third of a second."""
 
 CONTACT_WEIGHT, STILL_WEIGHT = 0.01, 0.01
-"""Of the contacts' cross-entropy, and of the square velocity of what rests."""
+"""Weights of the contacts' cross-entropy, and of the squared velocity of resting joints."""
 
 TRUE_UNTIL, OWN_FROM = 0.15, 0.35
-"""Scheduled sampling: shares of the training before which each step starts from the true state, and after which each
-starts from what the step before made; between, from either by chance."""
+"""Scheduled sampling: share of the training until which each step starts from the true state, and share from which each
+step starts from the previous step's output. Between them, the choice is random."""
 
 MIN_SCALE = 0.02
-"""Lower bound of a feature's standard deviation: some are constant, such as the root's place in its own frame"""
+"""Least standard deviation of a feature, because some are constant, such as the root's position in its own frame."""
 
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 _STATES_OF_MIXTURE = 40_000
 
 MIN_VARIANCE, MIXTURE_ITERATIONS = 1e-3, 100
-"""Variance added to each standardised feature's in the mixture of initial states, for joints on rigid bones have fewer
-degrees of freedom than coordinates; and the most iterations of expectation-maximisation."""
+"""Variance added to each standardised feature in the mixture of initial states, because joints on rigid bones have
+fewer degrees of freedom than coordinates; and largest number of expectation-maximisation iterations."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class Sequences:
     """Sequences of states, drawn from motion.
 
     Attributes:
-        motion: N frames, as prepared.
+        motion: N frames of prepared motion.
         load: (N, 8) whether `CONTACT_JOINTS` bear load.
         rest: (N, 8) whether they rest.
         starts: (M,) frames at which a sequence may start.
-        chances: (M,) the probability that it does.
+        chances: (M,) probabilities of these starts.
     """
 
     motion: MotionSet
@@ -78,7 +78,7 @@ class Sequences:
 
     @classmethod
     def of(cls, motion: MotionSet) -> Sequences:
-        """All sequences of a motion."""
+        """Return all sequences of a motion."""
         ends = zip(motion.clip_start, motion.clip_start[1:], strict=False)
         clips = [motion.positions[a:b].numpy() for a, b in ends]
         load, rest = (
@@ -92,12 +92,12 @@ class Sequences:
         return cls(motion, load, rest, rows[:, 0], chances / chances.sum())
 
     def draw(self, count: int, steps: int, rng: Rng) -> Batch:
-        """Random sequences of ``steps + 1`` states: as other builds, half of them mirrored."""
+        """Draw random sequences of ``steps + 1`` states, with varied builds, half of them mirrored."""
         first = rng.choice(self.starts, size=count, p=self.chances)
         return self.at(first[:, None] + np.arange(steps + 2), rng)
 
     def at(self, rows: np.ndarray, rng: Rng | None = None) -> Batch:
-        """The sequences of these frames (B, T), changed at random if ``rng`` is given."""
+        """Return the sequences of these frames (B, T), augmented if ``rng`` is given."""
         motion = self.motion
         root, rotations = motion.positions[rows, 0], motion.rotations[rows]
         offsets, load, rest = motion.offsets[rows[:, 0]], self.load[rows], self.rest[rows]
@@ -129,7 +129,7 @@ class Batch:
 
 
 def train_humor(options: TrainingOptions) -> Path:
-    """Train the transition model on prepared motion; the path of the weights."""
+    """Train the transition model on prepared motion; returns the path of the weights."""
     train, val = options.motion(flat=True)
     config = HumorConfig()
     sequences = Sequences.of(train)
@@ -141,7 +141,7 @@ def train_humor(options: TrainingOptions) -> Path:
 
 
 def recipe_of(config: HumorConfig, train: Sequences, val: Sequences) -> Recipe[HumorNet]:
-    """Of any configuration, on any motion: the ablations are trained alike."""
+    """Return the recipe of a configuration on some motion. The ablations use it too."""
 
     def loss_of(model: HumorNet, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         return transition_loss(model, train.draw(count, STEPS, rng), done, rng)
@@ -154,7 +154,7 @@ def recipe_of(config: HumorConfig, train: Sequences, val: Sequences) -> Recipe[H
 
 @torch.no_grad()
 def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
-    """Fit what gradients do not: the mean and scale of features, and the mixture of initial states."""
+    """Fit the parameters without gradients: mean and scale of features, and the mixture of initial states."""
     rng = np.random.default_rng(seed)
     states = sequences.draw(_STATES_OF_MIXTURE, 0, rng).states[:, 0]
     inputs = features(canonical(states, states))
@@ -167,11 +167,11 @@ def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
     """Fit the model's mixture of initial states (HuMoR, section 3) by expectation-maximisation.
 
     Args:
-        model: whose buffers are filled.
+        model: the model whose buffers are filled.
         inputs: (N, `FEATURES`) standardised features of states in their canonical frames.
-        seed: of the initial responsibilities.
+        seed: random seed of the initial responsibilities.
     """
-    from sklearn.mixture import GaussianMixture  # of the extra `train`, and slow to import
+    from sklearn.mixture import GaussianMixture  # in the extra `train`, and slow to import
 
     mixture = GaussianMixture(
         model.config.components, reg_covar=MIN_VARIANCE, max_iter=MIXTURE_ITERATIONS, random_state=seed
@@ -182,13 +182,13 @@ def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
 
 
 def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-    """Equation 7: reconstruction, KL divergence and regularisers, of steps from states by scheduled sampling.
+    """Compute equation 7: reconstruction, KL divergence and regularisers, with scheduled sampling of the states.
 
     Args:
-        model: in training.
-        batch: of sequences.
-        done: share of the training, 0 to 1.
-        rng: of which steps start from the true state.
+        model: the model, in training mode.
+        batch: sequences.
+        done: progress of the training, 0 to 1.
+        rng: random generator that selects the steps that start from the true state.
 
     Returns:
         The loss, and its terms by name.
@@ -219,7 +219,7 @@ def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tup
 
 @torch.no_grad()
 def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
-    """The states (B, T) that steps start from: each with probability ``own`` the model's own, of the step before."""
+    """Return the states (B, T) from which steps start: the model's previous output with probability ``own``."""
     states = [batch.states[:, 0]]
     count, steps = batch.contacts.shape[:2]
     for t in range(steps - 1):
@@ -233,11 +233,12 @@ def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
 
 
 def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
-    """On unseen people, over the seconds that travel farthest: errors of reconstruction and of prediction.
+    """Evaluate reconstruction and prediction on unseen people, over the seconds with the longest travel.
 
     Returns:
-        ``val reconstruction mm``, the mean error of joints at the end of a second rolled out by the posterior's means;
-        ``val prediction mm``, after half a second, by the prior's; ``val rest F1`` of heels and toes along the former.
+        ``val reconstruction mm``, the mean joint error at the end of a one-second rollout with the posterior's means;
+        ``val prediction mm``, the error after half a second with the prior's means; ``val rest F1`` of heels and toes
+        in the first.
     """
     steps = int(FPS)
     rows = unseen.motion.all_windows(steps + 2, steps)

@@ -1,8 +1,8 @@
 """Training of the mixture: ``steadypose train mixture --data MOCAP``, resumable.
 
-Clips of true motion pass through simulated sensors and the live node's own bank. The loss is the benchmark's position
-error (mm) and acceleration error (mm/frame²), of each clip relative to those of the best single expert for that clip,
-so that no kind of sensor or motion dominates. The standard deviation is trained by its likelihood.
+Clips of true motion pass through simulated sensors and the live node's bank. The loss consists of the benchmark's
+position error (mm) and acceleration error (mm/frame²). Each clip's errors are relative to those of its best single
+expert, so that no kind of sensor or motion dominates. The standard deviation is trained by its likelihood.
 """
 
 from __future__ import annotations
@@ -40,36 +40,37 @@ ITERATIONS, RATE = 6000, 2e-3
 """Number of optimiser steps, and the initial learning rate."""
 
 FRAMES = 90
-"""Number of frames of a clip, which begins as a stream begins."""
+"""Length of a clip, frames; it starts like a stream."""
 
 CLIPS, DELAYS_A_STEP = 16, 2
-"""Number of clips of each delay, and of delays, in an optimiser step."""
+"""Numbers of clips per delay, and of delays, in an optimiser step."""
 
 DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
 
 MIN_MM = 1.0
-"""Error added to the best expert's position error in the denominator, so that a perfect input does not dominate, mm."""
+"""Error added to the best expert's position error in the denominator, mm, so that noise-free inputs do not dominate."""
 
 SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
-"""Weight of the acceleration error, by delay in frames: without delay, smoothness costs lag."""
+"""Weight of the acceleration error, by delay in frames; without delay, smoothness costs lag."""
 
 MIN_SMOOTH_MM = 0.5
-"""The same of the acceleration error, mm/frame²."""
+"""Error added to the best expert's acceleration error in the denominator, mm/frame²."""
 
 SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
-"""Weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT. Joints are fast in few
-frames, in which filters lag most. Acceleration errors are weighted by the inverse of its root."""
+"""Constants of the weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT.
+Joints are fast in few frames, in which filters lag most. Acceleration errors are divided by the weight's square
+root."""
 
 LAG = 1.0
-"""Weight of a clip's position error above that of the expert nearest to the truth, relative to it: where a sensor's
-errors last, smoothness must not be bought by lag."""
+"""Weight of a clip's relative excess of position error over the most accurate expert. In time-correlated errors,
+smoothness must not come at the price of lag."""
 
 DEVIATION = 0.3
 """Weight of the negative log-likelihood in the loss."""
 
 AVERAGE = 0.999
-"""Decay of the exponential moving average of the weights, which is what is saved."""
+"""Decay of the exponential moving average of the weights, which is saved."""
 
 
 class Batch(NamedTuple):
@@ -87,7 +88,7 @@ class Batch(NamedTuple):
 
 
 def through_bank(sensed: Sensed, delay: int) -> Batch:
-    """Clips with features as the live node computes them; the last ``delay`` frames are left out."""
+    """Compute the live node's features of clips, without the last ``delay`` frames."""
     clips, frames = sensed.seen.shape[:2]
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
@@ -129,8 +130,8 @@ def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Err
     Args:
         places: (C, T, 22, 3) metres, estimates; may be NaN where the weight is 0.
         truth: (C, T, 22, 3) metres.
-        weight: (C, T, 22) of all errors.
-        counts: (C, T, 22) further weight of position errors; acceleration errors are divided by its root.
+        weight: (C, T, 22) weight of all errors.
+        counts: (C, T, 22) additional weight of position errors; acceleration errors are divided by its square root.
     """
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
@@ -157,13 +158,13 @@ class Loss:
 
 
 def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
-    """The loss of clips of one delay."""
+    """Compute the loss of clips with one delay."""
     smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
     places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
-    weight = known / (1.0 + batch.gap.clamp(min=0))  # far from any observation nothing can be learned
+    weight = known / (1.0 + batch.gap.clamp(min=0))  # nothing can be learned far from any observation
     seen = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
@@ -181,7 +182,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
 
 
 def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
-    """Set the mean and standard deviation by which features are normalised."""
+    """Set mean and standard deviation that normalise features."""
     rng = np.random.default_rng((seed, 7))
     rows = torch.cat([through_bank(sensors.draw(32, rng), int(d)).features.reshape(-1, FEATURES) for d in DELAYS])
     network.mean.copy_(rows.mean(dim=0))
@@ -189,9 +190,10 @@ def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
 
 
 def train_mixture(options: TrainingOptions) -> Path:
-    """Train on the recordings in the folder ``options.data`` that are free for products; the path of the weights.
+    """Train on recordings in the folder ``options.data`` that are licensed for products; returns the weights' path.
 
-    Prepared arrays, at several speeds, lie in the run's folder. From ``options.start`` the rate is half.
+    Prepared arrays, at several speeds, are kept in the run's folder. With ``options.start``, the learning rate is
+    halved.
     """
     arrays = options.path("mixture").parent / "arrays"
     if not (arrays / "pairs.npz").is_file():

@@ -1,5 +1,7 @@
-"""Models that are moments of motion, measured in seconds: the Gaussian of postures (``steadypose train posture``), and
-the covariance of joints' accelerations (``steadypose train body_modes --data MOCAP``).
+"""Models that are moments of motion and take seconds to fit.
+
+They are the Gaussian of postures (``steadypose train posture``) and the covariance of joints' accelerations
+(``steadypose train body_modes --data MOCAP``).
 """
 
 from __future__ import annotations
@@ -23,10 +25,10 @@ from steadypose.training.loop import TrainingOptions
 from steadypose.training.weights import save_weights
 
 FRAMES = 150_000
-"""Number of bodies, of each source in proportion to the root of its length: dance is short and unlike the rest."""
+"""Number of bodies; sources are weighted by the square root of their length, because dance is short and different."""
 
 TURN, SHIFT = 0.12, 0.02
-"""Standard deviations of the error of a noisy trunk's frame, about and along an axis, radians and metres."""
+"""Standard deviations of the error of a noisy trunk frame, about an axis in radians and along an axis in metres."""
 
 
 class Posture(nn.Module):
@@ -45,7 +47,7 @@ class Posture(nn.Module):
 
 
 def train_posture(options: TrainingOptions) -> Path:
-    """Fit the Gaussian to the training split of ``options.data``; the path of the weights."""
+    """Fit the Gaussian to the training split of ``options.data``; returns the path of the weights."""
     path, rng = options.path("posture"), np.random.default_rng(options.seed)
     motion = MotionSet.load(options.data, options.weights, "train")
     lengths = np.diff(motion.clip_start)
@@ -66,7 +68,7 @@ def train_posture(options: TrainingOptions) -> Path:
 def postures(
     positions: NDArray[np.float64], offsets: NDArray[np.float64], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(N, 69) of bodies (N, 22, 3), in their trunks' frames, which are off by chance."""
+    """(N, 69) postures of bodies (N, 22, 3), in their trunk frames with random errors."""
     mirrored = rng.random(len(positions)) < 0.5
     for values in (positions, offsets):
         values[mirrored] = values[mirrored][:, MIRROR] * (1.0, -1.0, 1.0)
@@ -79,8 +81,11 @@ def postures(
 
 
 def covariance_of(motion: Motion) -> NDArray[np.float64]:
-    """(22, 22) covariance along an axis of the accelerations of motion at its own speed, of mean variance 1: the mean
-    of its sources', each relative to its own mean variance, so that the longest recording does not decide."""
+    """(22, 22) covariance along an axis of the accelerations of motion at its own speed, with mean variance 1.
+
+    It is the mean of the sources' covariances, each relative to its mean variance, so that long sources do not
+    dominate.
+    """
     parts = []
     for source in sorted(set(motion.source)):
         total = np.zeros((22, 22))
@@ -92,7 +97,7 @@ def covariance_of(motion: Motion) -> NDArray[np.float64]:
 
 
 def train_modes(options: TrainingOptions) -> Path:
-    """Learn it from the recordings in the folder ``options.data`` that are free for products; the weights' path."""
+    """Compute it from recordings in ``options.data`` that are licensed for products; returns the weights' path."""
     path = options.path("body_modes")
     arrays = options.path("mixture").parent / "arrays"
     if not (arrays / "pairs.npz").is_file():

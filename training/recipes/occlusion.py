@@ -1,10 +1,10 @@
 """The occlusion network and its training: ``steadypose train occlusion --data MOCAP``, resumable.
 
-It weighs the candidates for an occluded joint's position, and states a standard deviation. Stacked generalisation
-(Wolpert 1992): the weights of several models are learned from their errors where they have to answer. A convex
-combination of the candidates is never farther off than the worst of them.
+The network weighs the candidates for an occluded joint's position, and predicts a standard deviation. This is stacked
+generalisation (Wolpert 1992): weights of several models are learned from their errors on held-out tasks. A convex
+combination of the candidates is never worse than the worst candidate.
 
-Clips of true motion go through simulated sensors, lose joints, and go through the pipeline itself. The candidates and
+Clips of true motion pass through simulated sensors, lose joints, and pass through the pipeline. The candidates and
 features of its occluded joints, with the truth, are the training data.
 """
 
@@ -36,31 +36,31 @@ from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 FIRST_LOG_SIGMA = 4.0
-"""Initial logarithm of the standard deviation in millimetres."""
+"""Initial logarithm of the standard deviation, which is in millimetres."""
 
 ITERATIONS, BATCH, LEARNING_RATE, WEIGHT_DECAY = 800, 4096, 3e-3, 0.1
-"""Occluded joints a step; AdamW's rate at the start, which falls along a cosine, and its weight decay. More steps fit
-the people of training (benchmarks/NOTEBOOK.md, hidden joints)."""
+"""Number of steps; occluded joints per step; initial learning rate of AdamW, which falls along a cosine; weight decay.
+More steps overfit the training people (benchmarks/NOTEBOOK.md, hidden joints)."""
 
 FRAMES, CLIPS = 120, 64
-"""Frames of a clip, and clips of a run, side by side as bodies."""
+"""Length of a clip, frames, and number of clips that are processed together as bodies of a run."""
 
 RECORDED = {"train": 16, "val": 4}
-"""Runs of the pipeline for each split."""
+"""Number of pipeline runs for each split."""
 
 ROWS = 60_000
-"""Occluded joints kept of a run, at most."""
+"""Largest number of occluded joints kept from a run."""
 
 RADII = 0.12, 0.2
-"""Range of the radius of a trunk that hides arms, metres."""
+"""Range of radii of a trunk that hides arms, metres."""
 
 SEEN_FIRST = 8, 40
-"""Range of the frames before anything is hidden, of clips that lose what is below or on one side."""
+"""Range of the time before joints are hidden, in clips that lose the lower part or one side, frames."""
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 
 MIN_MM, DEVIATION = 30.0, 0.02
-"""Added to the best candidate's error, by which errors are divided; and weight of the likelihood."""
+"""Error added to the best candidate's error in the denominator of the loss, mm; and weight of the likelihood."""
 
 _ARMS, _LEGS = limbs(("shoulder", "elbow", "wrist")), limbs(("knee", "ankle", "foot"))
 _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
@@ -112,8 +112,11 @@ class OcclusionNet(nn.Module):
         nn.init.constant_(self.write.bias[CANDIDATES:], FIRST_LOG_SIGMA)
 
     def forward(self, features: Tensor, joint: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (N, 4) of the candidates, and the logarithm (N,) of the standard deviation along an axis in
-        millimetres, of features (N, `FEATURES`) of joints (N,)."""
+        """Predict from features (N, `FEATURES`) of joints (N,).
+
+        Returns the weights (N, 4) of the candidates, and the logarithm (N,) of the standard deviation along an axis,
+        which is in millimetres.
+        """
         read = torch.relu(self.read((features - self.mean) / self.deviation) + self.joint[joint])
         written = self.write(torch.relu(self.think(read)) + read)
         return written[:, :CANDIDATES].softmax(dim=-1), written[:, CANDIDATES].clamp(MIN_LOG_SIGMA, MAX_LOG_SIGMA)
@@ -124,9 +127,9 @@ class Rows:
     """N occluded joints.
 
     Attributes:
-        features: (N, `FEATURES`).
-        joint: (N,) its index.
-        candidates: (N, 4, 3) metres from the first candidate.
+        features: (N, `FEATURES`) features.
+        joint: (N,) index of the joint.
+        candidates: (N, 4, 3) metres relative to the first candidate.
         truth: (N, 3) metres, likewise.
     """
 
@@ -139,8 +142,8 @@ class Rows:
 def occlusions(truth: Floats, rng: Rng) -> Bools:
     """(T, C, 22) which joints of clips (T, C, 22, 3) metres are hidden.
 
-    By chance 20 % of clips lose what is low, 10 % what is on one side, 20 % arms behind the trunk, the others limbs for
-    2 to 100 frames.
+    At random, 20 % of clips lose the lower part, 10 % one side, 20 % arms behind the trunk, and the others limbs for 2
+    to 100 frames.
     """
     frames, clips = truth.shape[:2]
     hidden = np.zeros(truth.shape[:3], dtype=bool)
@@ -170,7 +173,7 @@ def occlusions(truth: Floats, rng: Rng) -> Bools:
 
 
 def _arms_behind(place: Floats, rng: Rng) -> Bools:
-    """(T, 22) which elbows and wrists of a clip (T, 22, 3) metres the trunk hides from a camera 3 m away."""
+    """(T, 22) which elbows and wrists of a clip (T, 22, 3) metres are hidden by the trunk from a camera 3 m away."""
     middle, towards = place[len(place) // 2, J["pelvis"]], rng.uniform(0.0, 2 * np.pi)
     camera = middle + (3.0 * np.cos(towards), 3.0 * np.sin(towards), rng.uniform(0.0, 0.8))
     arms = [joint for arm in _ARMS for joint in arm[1:]]
@@ -182,7 +185,7 @@ def _arms_behind(place: Floats, rng: Rng) -> Bools:
 
 
 class _Recorder:
-    """Takes the network's place and records its inputs by frame; nothing reads its answers."""
+    """Replaces the network and records its inputs by frame; its outputs are not used."""
 
     def __init__(self) -> None:
         self.frame = 0
@@ -194,7 +197,7 @@ class _Recorder:
 
 
 def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, split: str) -> Rows:
-    """Occluded joints of the pipeline, over so many ``runs`` of `CLIPS` clips."""
+    """Record the pipeline's occluded joints over ``runs`` runs of `CLIPS` clips."""
     found: list[tuple[Any, ...]] = []
     for run in track(range(runs), description=f"occlusions, {split}"):
         rng = np.random.default_rng((seed, run, split == "val"))
@@ -224,7 +227,7 @@ def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, spli
 
 
 def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """The loss of `Rows`; the error (N,) of each, and of the best of its candidates, mm."""
+    """Return the loss of `Rows`, the error (N,) of each, and that of its best candidate, mm."""
     weights, log_sigma = network(rows["features"], rows["joint"])
     off = 1e3 * ((weights[..., None] * rows["candidates"]).sum(dim=1) - rows["truth"])
     error = (off.square().sum(dim=-1) + 1.0).sqrt()
@@ -235,9 +238,9 @@ def loss_of(network: OcclusionNet, rows: dict[str, Tensor]) -> tuple[Tensor, Ten
 
 
 def train_occlusion(options: TrainingOptions) -> Path:
-    """Train the occlusion network on the recordings in the folder ``options.data``; the path of the weights.
+    """Train the occlusion network on the recordings in the folder ``options.data``; returns the path of the weights.
 
-    They are those of the mixture that are free for products; its prepared arrays serve too.
+    It uses the mixture's recordings that are licensed for products, or its prepared arrays.
     """
     directory = options.path("occlusion").parent
     if not (directory / "arrays" / "pairs.npz").is_file():
@@ -271,7 +274,7 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
 
 def _rows(directory: Path, split: str, seed: int) -> Rows:
-    """Those of a split, recorded once; a recorder stands in the network's place, so that any weights serve."""
+    """Return the rows of a split, recorded once. A recorder replaces the network, so any weights will do."""
     path = directory / f"rows-{split}.npz"
     if not path.is_file():
         pairs = load_kinect(directory / "arrays" / "pairs.npz").of(

@@ -1,9 +1,8 @@
 """The trajectory network and its training: root velocity from the body's own motion (HM-VAE, section 3.3).
 
-The paper convolves joint positions over the skeleton and time. Here a recurrent network reads each frame's places and
-velocities, turned to the body's heading, which the official code leaves to the network to learn; it sees no future, so
-that no delay is added. Beside the velocity it predicts the standard deviation of that, and, in training only, HuMoR's
-eight contacts.
+The paper convolves joint positions over the skeleton and time. Here, a recurrent network reads each frame's positions
+and velocities, turned to the body's heading; the official code lets the network learn this. It sees no future frames,
+so it adds no delay. It also predicts the velocity's standard deviation and, in training only, HuMoR's eight contacts.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class RootMotion(NamedTuple):
-    """What the network predicts of each frame, in the body's heading."""
+    """The network's predictions for each frame, in the frame of the body's heading."""
 
     velocity: Tensor
-    """(B, T, 3) m/s, of the root"""
+    """(B, T, 3) m/s, velocity of the root."""
     log_sigma: Tensor
-    """(B, T, 3) log of the standard deviation of that along each axis, m/s"""
+    """(B, T, 3) logarithm of the velocity's standard deviation along each axis, in m/s."""
     contact_logits: Tensor
-    """(B, T, 8) of `CONTACT_JOINTS`"""
+    """(B, T, 8) logits of contact of `CONTACT_JOINTS`."""
 
 
 class TrajectoryNet(nn.Module):
@@ -48,25 +47,25 @@ class TrajectoryNet(nn.Module):
         self.head = nn.Linear(config.hidden, 3 + 3 + len(CONTACT_JOINTS))
 
     def forward(self, features: Tensor) -> RootMotion:
-        """Of every frame of `velocity_features` (B, T, FEATURES) from a body's first frame on."""
+        """Predict for every frame of `velocity_features` (B, T, FEATURES) from a body's first frame on."""
         return RootMotion(*self.head(self.motion(features)[0]).split([3, 3, len(CONTACT_JOINTS)], dim=-1))
 
 
 def _features(joints: Tensor, turn: Tensor) -> Tensor:
-    """`velocity_features` (B, T, FEATURES) of joints (B, T, 22, 3) metres from the root, turned by (B, T, 3, 3)."""
+    """`velocity_features` (B, T, FEATURES) of joints (B, T, 22, 3) metres from the root, turned by ``turn``."""
     before = torch.cat([joints[:, :1], joints[:, :-1]], dim=1)
     velocity = ((joints - before) / FRAME_S @ turn).clamp(-FASTEST, FASTEST) / SPEED
     return torch.cat([joints @ turn / FROM_ROOT, velocity], dim=-1).flatten(2)
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 6_000, 64, 4e-3
-"""Windows a step; the rate at the start."""
+"""Number of steps; windows per step; initial learning rate."""
 
 WINDOW = 72
-"""Frames of a training window, 2.4 s."""
+"""Length of a training window, frames (2.4 s)."""
 
 WARM_UP = 12
-"""Frames of a window before which nothing is scored: there is not yet motion enough to read."""
+"""Number of first frames of a window without a loss, because they contain too little motion."""
 
 RATES = (0.6, 2.0)
 """Range of factors on the speed of training motion."""
@@ -75,25 +74,27 @@ SCALES = (0.8, 1.15)
 """Range of factors on people's sizes in training."""
 
 MIN_SPEED = 0.15
-"""m/s: a window is drawn as often as its root is fast, and one that stands still as if it were this fast."""
+"""Least speed in the sampling weight of a window, which is proportional to the speed of its root, m/s."""
 
 TILT_SD, YAW_SD, YAW_STEP_SD = np.deg2rad(3.0), np.deg2rad(6.0), np.deg2rad(1.0)
-"""Radians: how well gravity and a window's heading are known, and how far the heading's error moves in a frame."""
+"""Standard deviations of the errors of gravity and of a window's heading, and of the heading error's change per frame,
+radians."""
 
 NOISE_SD = 0.02
-"""Metres: the most noise a window's joints get, half of it on average: what a prior leaves of a sensor's."""
+"""Largest noise of a window's joints, on average half of it, metres: the noise that remains after the prior."""
 
 OFFSET_SD = 0.015
-"""Metres: how far a sensor's idea of a joint lies from that of the motion capture, for a whole window."""
+"""Standard deviation of the offset between a sensor's and motion capture's definition of a joint in a window,
+metres."""
 
 IMPUTED_SHARE = 0.3
-"""Of windows, one limb of which is hidden for a while and stays where it was."""
+"""Share of windows in which a limb is hidden for a while and held at its last position."""
 
 VELOCITY_WEIGHT, DRIFT_WEIGHT, NLL_WEIGHT, CONTACT_WEIGHT = 2.0, 0.5, 0.05, 0.1
-"""Of the velocity's error, the path's, the standard deviation's likelihood, and the contacts' cross-entropy."""
+"""Weights of the velocity's error, the path's error, the likelihood, and the contacts' cross-entropy."""
 
 SMALL = 0.3
-"""m/s: errors of the velocity count squared up to here, and linearly beyond."""
+"""Velocity error up to which the loss is quadratic, and beyond which it is linear, m/s."""
 
 _LIMBS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
@@ -101,11 +102,11 @@ _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 
 @dataclass(frozen=True)
 class _Motion:
-    """True motion, B windows of T frames, and one frame more at each end of the positions, for central differences.
+    """True motion in B windows of T frames. Positions have one more frame at each end, for central differences.
 
     Attributes:
         positions: (B, T + 2, 22, 3) metres, world.
-        yaw: (B, T) radians, where the body faces.
+        yaw: (B, T) radians, heading of the body.
         contacts: (B, T, 8) labels.
     """
 
@@ -116,12 +117,12 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _Windows:
-    """What the network is given and should predict.
+    """Input and targets of the network.
 
     Attributes:
-        features: (B, T, FEATURES).
-        turn: (B, T, 3, 3) from a frame's heading to the world.
-        velocity: (B, T, 3) m/s of the root, world.
+        features: (B, T, FEATURES) input.
+        turn: (B, T, 3, 3) rotations from a frame's heading to the world.
+        velocity: (B, T, 3) m/s, velocity of the root, world.
         contacts: (B, T, 8) labels.
     """
 
@@ -132,7 +133,7 @@ class _Windows:
 
 
 def train_trajectory(options: TrainingOptions) -> Path:
-    """Train the trajectory network on prepared motion; the path of the weights."""
+    """Train the trajectory network on prepared motion; returns the path of the weights."""
     train, val = options.motion(flat=True)
     starts, chances = _chances(train)
 
@@ -153,7 +154,7 @@ _SPAN = int(np.ceil((WINDOW + 1) * RATES[1])) + 2
 
 
 def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
-    """Where windows may start, and the chance of each: the faster the root, the likelier, for people mostly stand."""
+    """Return possible starts of windows, and their probabilities, which grow with the root's speed."""
     rows = motion.all_windows(_SPAN, step=2)
     coarse = motion.positions[rows[:, ::4], 0, :2]
     weights = MIN_SPEED + coarse.diff(dim=1).norm(dim=-1).sum(dim=1).numpy() / (_SPAN * FRAME_S)
@@ -161,7 +162,7 @@ def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sample(motion: MotionSet, starts: np.ndarray, chances: np.ndarray, count: int, rng: Rng) -> _Motion:
-    """Random windows, replayed faster or slower, of larger and smaller people."""
+    """Draw random windows, with varied speeds and sizes of people."""
     rows = rng.choice(starts, size=count, p=chances)[:, None] + np.arange(_SPAN)
     times = np.exp(rng.uniform(np.log(RATES[0]), np.log(RATES[1]), (count, 1))) * np.arange(WINDOW + 2)
     frames = torch.from_numpy(np.take_along_axis(rows, times.astype(np.int64), axis=1))
@@ -188,7 +189,7 @@ def _mirror_half(motion: _Motion) -> _Motion:
 
 
 def _windows(motion: _Motion, rng: Rng, noise_sd: float | None = None) -> _Windows:
-    """Motion as a prior would leave it: noisy, tilted, its heading known but roughly; ``noise_sd`` as of `_corrupt`."""
+    """Simulate the prior's output: noisy, tilted, with an approximate heading; ``noise_sd`` as in `_corrupt`."""
     positions, count = motion.positions, len(motion.positions)
     velocity = (positions[:, 2:, 0] - positions[:, :-2, 0]) / (2 * FRAME_S)
     wrong = rng.normal(0.0, YAW_SD, (count, 1))
@@ -200,12 +201,12 @@ def _windows(motion: _Motion, rng: Rng, noise_sd: float | None = None) -> _Windo
 
 
 def _corrupt(joints: Tensor, rng: Rng, noise_sd: float | None = None) -> Tensor:
-    """Add noise that lasts (AR(1)) to joints (B, T, 22, 3), the root's too, and hold a limb still in some windows.
+    """Add time-correlated noise (AR(1)) to joints (B, T, 22, 3), including the root, and hold a limb in some windows.
 
     Args:
-        joints: metres from the root.
-        rng: random numbers.
-        noise_sd: metres, of every window; random up to `NOISE_SD` if left out.
+        joints: metres relative to the root.
+        rng: random generator.
+        noise_sd: metres, noise of every window; random up to `NOISE_SD` if omitted.
     """
     count, time = joints.shape[:2]
     sd = rng.uniform(0.0, NOISE_SD, (count, 1, 1, 1)) if noise_sd is None else np.full((count, 1, 1, 1), noise_sd)
@@ -223,14 +224,14 @@ def _corrupt(joints: Tensor, rng: Rng, noise_sd: float | None = None) -> Tensor:
 
 
 def _errors(predicted: RootMotion, windows: _Windows) -> tuple[Tensor, Tensor]:
-    """(B, T, 3) m/s after `WARM_UP`: what velocities are off in each frame's heading, and the same in the world."""
+    """(B, T, 3) m/s, velocity errors after `WARM_UP`, in each frame's heading and in the world."""
     off = predicted.velocity - (windows.velocity[:, :, None] @ windows.turn)[:, :, 0]
     turned = (off[:, :, None] @ windows.turn.mT)[:, :, 0]
     return off[:, WARM_UP:], turned[:, WARM_UP:]
 
 
 def _loss(predicted: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, float]]:
-    """Equation 9, but that large errors count linearly; the likelihood of the error, and contacts; each a mean."""
+    """Equation 9 with linear cost of large errors, the likelihood of the error, and contacts; each term is a mean."""
     off, in_world = _errors(predicted, windows)
     log_sigma = predicted.log_sigma[:, WARM_UP:].clamp(-5.0, 2.0)
     l_velocity = F.smooth_l1_loss(off, torch.zeros_like(off), beta=SMALL)
@@ -245,7 +246,7 @@ def _loss(predicted: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, f
 
 @torch.no_grad()
 def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) -> tuple[RootMotion, _Windows]:
-    """What the network predicts of about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
+    """Predict about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
     rows = motion.all_windows(length + 2, step=length)
     rows = rows[:: max(len(rows) // count, 1)]
     inner = rows[:, 1:-1]
@@ -255,11 +256,11 @@ def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) 
 
 
 def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, float]:
-    """Errors on unseen people.
+    """Evaluate the errors on unseen people.
 
     Returns:
-        ``val velocity m/s``, the root mean square of the velocity's error along an axis; ``val 1 s drift cm``, that of
-        the horizontal trajectory after one second.
+        ``val velocity m/s``, the RMS velocity error along an axis; ``val 1 s drift cm``, that of the horizontal
+        trajectory after one second.
     """
     off, in_world = _errors(*_validate(model, motion, WINDOW, count=512))
     drift = in_world[:, :30, :2].sum(dim=1).norm(dim=-1) * FRAME_S * 100
@@ -270,9 +271,9 @@ def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, fl
 
 
 def calibrate(model: TrajectoryNet, motion: MotionSet) -> TrajectoryConfig:
-    """The network's configuration with the errors that validation finds: how large they are, and how long they last.
+    """Return the network's configuration with the size and correlation time of its errors on validation.
 
-    A second of accumulated velocity strays by sigma² · correlation_s if an error of size sigma lasts correlation_s.
+    The position variance after one second is sigma² · correlation_s for errors of size sigma and this correlation time.
     """
     predicted, windows = _validate(model, motion, WINDOW, count=2048)
     error = _errors(predicted, windows)[0] * torch.exp(-predicted.log_sigma[:, WARM_UP:])

@@ -1,8 +1,8 @@
-"""A sensor's systematic error as a function of the pose that it shows, learned from recordings of the sensor beside a
-reference: UI-PRMD's Kinect and Vicon, or a user's own.
+"""Learns a sensor's bias as a function of the observed pose, from recordings of the sensor with a reference.
 
-A smoother removes jitter; most of a depth camera's error is slow: it depends on the pose, on self-occlusion and on the
-direction of view, and stays while these do. The network gives, frame by frame, the correction of each joint.
+The recordings are UI-PRMD's Kinect and Vicon, or a user's own. A smoother removes jitter, but most of a depth camera's
+error is bias. It depends on the pose, on self-occlusion and on the view direction, and lasts as long as these. The
+network predicts the correction of each joint, frame by frame.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class CorrectionNet(nn.Module):
-    """Features of a frame (B, FEATURES) to what must be added to each joint, (B, 22, 3) metres, trunk frame."""
+    """Maps features of a frame (B, FEATURES) to the corrections of joints (B, 22, 3), metres, trunk frame."""
 
     mean: Tensor
     scale: Tensor
@@ -59,13 +59,13 @@ class CorrectionNet(nn.Module):
         )  # fmt: skip
 
     def forward(self, features: Tensor) -> Tensor:
-        """NaN features are missing joints: they read as the training mean."""
+        """Predict corrections; NaN features (missing joints) are replaced by the training mean."""
         x = torch.nan_to_num((features - self.mean) / self.scale)
         return self.layers(x).reshape(-1, 22, 3)
 
 
 def mirror_features(x: Tensor) -> Tensor:
-    """The features (B, FEATURES) of the same bodies seen in a mirror: left is right."""
+    """Return the features (B, FEATURES) of the mirrored bodies, with left and right exchanged."""
     vectors = x[:, : 3 * VECTORS].reshape(len(x), VECTORS, 3) * x.new_tensor([1.0, -1.0, 1.0])
     joints = vectors[:, :-2].reshape(len(x), len(HISTORY), 22, 3)[:, :, MIRROR.tolist()]
     return torch.cat(
@@ -74,22 +74,22 @@ def mirror_features(x: Tensor) -> Tensor:
 
 
 ITERATIONS, BATCH, LEARNING_RATE, EVALUATIONS = 4_000, 256, 1e-3, 40
-"""Frames a step; the rate at the start, which rises to twice as much and falls to nothing."""
+"""Numbers of steps and of frames per step; initial learning rate, which first doubles, then falls to 0; evaluations."""
 HIDE = 0.1
-"""Share of training frames with joints hidden, so that the network can do without some."""
+"""Share of training frames with hidden joints, so that the network tolerates missing joints."""
 INPUT_NOISE = 0.03
-"""Standard deviations of noise on the inputs: six people are few."""
+"""Noise on the inputs, standard deviations of a feature, as augmentation for only six people."""
 
 
 @dataclass(frozen=True)
 class SensorTake:
-    """A person as a sensor has them, and as a reference does, at the same moments of 30 Hz.
+    """A person recorded by a sensor and by a reference at the same times, at 30 Hz.
 
     Attributes:
-        person: who it is.
-        observed: (T, 22, 3) metres, z up, by the sensor; NaN where unobserved.
-        camera: (3,) metres, where the sensor stands in that frame.
-        truth: (T, 22, 3) metres, by the reference, in any frame of its own; NaN where unknown.
+        person: name of the person.
+        observed: (T, 22, 3) metres, z up, from the sensor; NaN where unobserved.
+        camera: (3,) metres, position of the sensor in that frame.
+        truth: (T, 22, 3) metres, from the reference, in any frame; NaN where unknown.
     """
 
     person: str
@@ -100,12 +100,12 @@ class SensorTake:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How far one person's joints are from the reference, mean over joints and frames, in metres.
+    """Mean distance of one person's joints from the reference over joints and frames, metres.
 
     Attributes:
-        person: who it is; the correction was learned from all others.
-        observed_m: as the sensor has them, moved rigidly to where they fit best, once for each take.
-        corrected_m: the same, corrected.
+        person: name of the person; the correction was learned from all others.
+        observed_m: error of the sensor's joints after the best rigid alignment of each take.
+        corrected_m: the same with correction.
     """
 
     person: str
@@ -114,9 +114,9 @@ class HeldOut:
 
 
 def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN_SUBJECTS) -> Path:
-    """Train the Kinect's correction on ``ui_prmd.npz``, on these subjects of it; the path of the weights."""
-    # All six people: with one held back to watch, the other five teach measurably less (benchmarks/NOTEBOOK.md). The
-    # length of the training was chosen that way once; `steadypose evaluate kinect_vicon` has people never seen.
+    """Train the Kinect's correction on these subjects of ``ui_prmd.npz``; returns the path of the weights."""
+    # Train on all six people: with one held out, the other five give measurably worse results (benchmarks/NOTEBOOK.md).
+    # The length of the training was once chosen that way. `steadypose evaluate kinect_vicon` has unseen people.
     return _train(
         options, *_examples(options.data, subjects), "systematic error of a Kinect v2",
         f"UI-PRMD, Kinect beside Vicon: {', '.join(subjects)}",
@@ -125,7 +125,7 @@ def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN
 
 
 def train_sensor(takes: Sequence[SensorTake], options: TrainingOptions) -> Path:
-    """Train the correction of the sensor named ``options.weights`` on recordings of it; the path of the weights."""
+    """Train the correction of the sensor named ``options.weights`` on its recordings; returns the weights' path."""
     people = sorted({take.person for take in takes})
     x, y = _usable(*(np.concatenate(part) for part in zip(*map(_take, takes), strict=True)))
     data = f"{len(takes)} recordings of {len(people)} people beside a reference"
@@ -133,11 +133,11 @@ def train_sensor(takes: Sequence[SensorTake], options: TrainingOptions) -> Path:
 
 
 def leave_one_person_out(takes: Sequence[SensorTake], options: TrainingOptions) -> Iterator[HeldOut]:
-    """Every person's error under a correction learned from all others: what somebody new can expect.
+    """Yield every person's error with a correction learned from all others, which a new person can expect.
 
     Args:
-        takes: of two people at least.
-        options: of each training; ``runs`` is a folder without runs.
+        takes: takes of at least two people.
+        options: options of each training; ``runs`` is a folder without runs.
     """
     for number, person in enumerate(sorted({take.person for take in takes})):
         others = [take for take in takes if take.person != person]
@@ -153,7 +153,7 @@ def leave_one_person_out(takes: Sequence[SensorTake], options: TrainingOptions) 
 
 
 def _train(options: TrainingOptions, x: Tensor, y: Tensor, described: str, data: str, licence: str) -> Path:
-    """Train on features x (N, FEATURES) and what is missing y (N, 22, 3); the path of the weights."""
+    """Train on features x (N, FEATURES) and corrections y (N, 22, 3); returns the path of the weights."""
     iterations = options.iterations or ITERATIONS
     evaluations = min(EVALUATIONS, max(iterations // 100, 1))
     recent = deque[float](maxlen=max(iterations // evaluations, 1))
@@ -183,19 +183,19 @@ def _train(options: TrainingOptions, x: Tensor, y: Tensor, described: str, data:
 
 
 def _examples(data: Path, subjects: Collection[str]) -> tuple[Tensor, Tensor]:
-    """Features (N, FEATURES) and the missing part (N, 22, 3) of every frame, metres in the trunk's frame."""
+    """Return features (N, FEATURES) and corrections (N, 22, 3) of every frame, metres in the trunk's frame."""
     return _usable(*(np.concatenate(part) for part in zip(*(_examples_of(data, s) for s in subjects), strict=True)))
 
 
 def _usable(x: np.ndarray, y: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Those frames of x (N, FEATURES) and y (N, 22, 3) whose trunk is observed."""
+    """Select the frames of x (N, FEATURES) and y (N, 22, 3) whose trunk is observed."""
     usable = np.isfinite(x[:, 0])
     return torch.from_numpy(x[usable]).float(), torch.from_numpy(y[usable]).float()
 
 
 @lru_cache(maxsize=8)
 def _examples_of(data: Path, subject: str) -> tuple[np.ndarray, np.ndarray]:
-    """Those of one person; kept, since people are left out one at a time to measure."""
+    """Return the examples of one person; cached, because evaluation leaves out one person at a time."""
     found = [_clip(pair) for pair in load_pairs(data, (subject,))]
     x, y = (np.concatenate(part) for part in zip(*found, strict=True))
     return x, y
@@ -216,14 +216,14 @@ def _take(take: SensorTake) -> tuple[np.ndarray, np.ndarray]:
 def _features_and_missing(
     observed: Floats, truth: Floats, alignment: tuple[Floats, Floats], camera: Floats, fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The features (T, FEATURES) of every frame, and what is missing (T, 22, 3) metres in the trunk's frame.
+    """Return features (T, FEATURES) and corrections (T, 22, 3) of every frame, metres in the trunk's frame.
 
     Args:
-        observed: (T, 22, 3) metres, z up, by the sensor.
-        truth: (T, 22, 3) metres, by the reference.
-        alignment: that turns and moves the truth to the sensor's frame.
-        camera: (3,) metres, where the sensor stands.
-        fps: frames a second.
+        observed: (T, 22, 3) metres, z up, from the sensor.
+        truth: (T, 22, 3) metres, from the reference.
+        alignment: rigid transform from the truth to the sensor's frame.
+        camera: (3,) metres, position of the sensor.
+        fps: frames per second.
     """
     smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
     smoothed = np.stack([smoother.update(frame, t / fps).positions for t, frame in enumerate(observed)])
@@ -234,7 +234,7 @@ def _features_and_missing(
 
 
 def _hide(x: Tensor, generator: np.random.Generator) -> Tensor:
-    """Take a few joints away in some of the frames."""
+    """Hide a few joints in some of the frames."""
     hidden = (generator.random((len(x), 1)) < HIDE) & (generator.random((len(x), 22)) < 0.2)
     mask = torch.from_numpy(hidden)
     return torch.cat(
