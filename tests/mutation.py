@@ -137,8 +137,10 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             if ast.dump(first) != ast.dump(last):
                 changed.elts[0], changed.elts[-1] = last, first
                 yield changed
-        case ast.Call(args=[first, *_, last]) if not any(isinstance(end, ast.Starred) for end in (first, last)):
-            if ast.dump(first) != ast.dump(last) and ast.unparse(node.func).rpartition(".")[2] not in SYMMETRIC:
+        case ast.Call(func=func, args=[first, *_, last]) if not any(
+            isinstance(end, ast.Starred) for end in (first, last)
+        ):
+            if ast.dump(first) != ast.dump(last) and ast.unparse(func).rpartition(".")[2] not in SYMMETRIC:
                 changed.args[0], changed.args[-1] = last, first
                 yield changed
         case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Raise():

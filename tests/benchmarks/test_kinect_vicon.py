@@ -1,4 +1,5 @@
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -160,7 +161,7 @@ def test_what_is_the_same_for_all_is_run_once_and_each_clip_gets_its_own() -> No
     clips = [clip(n, 12)._replace(name=f"{n}") for n in range(3)]
     kinect, asked = Kinect(cast(Bench, None), Path("nowhere.npz"), clips, clips), []
 
-    def run(some: list[Clip], stated: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
+    def run(some: Sequence[Clip], stated: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
         asked.append(len(some))
         told = [Stated(one.raw[..., 0], one.raw[:, 0, 0], one.raw[:, 0, 0] > 0) for one in some]
         return [one.raw for one in some], told if stated else None

@@ -108,9 +108,9 @@ def test_what_a_hostile_source_sends_is_survived_and_counted() -> None:
 def test_a_place_is_as_likely_as_normal_errors_make_it_against_somebody_new() -> None:
     """Errors of 0.1 m a frame, in height of 0.3 m at most besides; a new person in a hundred cubic metres."""
     away, across, up = np.array([0.2, -0.1, 0.15]), np.hypot(0.4, 0.1), np.hypot(0.3, 0.1)
-    expected = norm(0, [across, across, up]).logpdf(away).sum() - np.log(0.01)
-    assert _place_score(away, np.float64(0.4)) == pytest.approx(expected)
-    assert _place_score(np.full(3, np.nan), np.float64(0.4)) == -np.inf
+    expected = norm.logpdf(away, 0.0, [across, across, up]).sum() - np.log(0.01)
+    assert _place_score(away, np.array(0.4)) == pytest.approx(expected)
+    assert _place_score(np.full(3, np.nan), np.array(0.4)) == -np.inf
 
 
 def test_who_is_out_of_sight_is_expected_to_lose_the_velocity_within_a_second() -> None:
@@ -148,7 +148,7 @@ def test_longer_bones_are_somebody_elses_by_their_likelihood() -> None:
     same = 0.05**2 / 4 + 0.05**2
     found = identify._length_score(np.array([0]), np.array([1]))[0, 0]
     other = same + 2 * (0.1 * 0.415) ** 2
-    assert found == pytest.approx(norm(0, same**0.5).logpdf(0.05) - norm(0, other**0.5).logpdf(0.05) - 3.0)
+    assert found == pytest.approx(norm.logpdf(0.05, 0.0, same**0.5) - norm.logpdf(0.05, 0.0, other**0.5) - 3.0)
 
 
 @pytest.mark.parametrize(
