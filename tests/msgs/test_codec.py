@@ -13,9 +13,6 @@ from rosbags.typesys import Stores, get_typestore
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
 from steadypose.msgs.codec import (
-    MAX_BODIES,
-    MAX_EVENTS,
-    MAX_VALUES,
     ROS_DEFINITIONS,
     DecodeError,
     decode,
@@ -159,14 +156,14 @@ def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str
     """A valid message of a million bytes, of bodies of nothing, would keep a node busy for seconds."""
     example = EXAMPLES[topic]
     if isinstance(example, Diagnostics):
-        large = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES + 1)})
-        fits = dataclasses.replace(example, values={str(k): "" for k in range(MAX_VALUES)})
+        large = dataclasses.replace(example, values={str(k): "" for k in range(1001)})
+        fits = dataclasses.replace(example, values={str(k): "" for k in range(1000)})
     elif isinstance(example, PoseEvents):
-        large = dataclasses.replace(example, events=example.events[:1] * (MAX_EVENTS + 1))
-        fits = dataclasses.replace(example, events=example.events[:1] * MAX_EVENTS)
+        large = dataclasses.replace(example, events=example.events[:1] * 2049)
+        fits = dataclasses.replace(example, events=example.events[:1] * 2048)
     else:
-        large = dataclasses.replace(example, bodies=example.bodies[:1] * (MAX_BODIES + 1))
-        fits = dataclasses.replace(example, bodies=example.bodies[:1] * MAX_BODIES)
+        large = dataclasses.replace(example, bodies=example.bodies[:1] * 129)
+        fits = dataclasses.replace(example, bodies=example.bodies[:1] * 128)
     assert decode(topic, encode(fits)) == fits
     with pytest.raises(DecodeError, match="expected at most"):
         decode(topic, encode(large))
