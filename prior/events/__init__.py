@@ -1,5 +1,6 @@
-"""What people do, from ``pose/world``: entered, came near, sits, fell, raised a hand, waves, points, and so on.
+"""Detects events in ``pose/world``: entered, came near, sits, fell, raised a hand, waves, points, and so on.
 
-`features` computes from one body's joints the quantities that events depend on, with their standard deviations;
-`trigger` turns a quantity into something that begins and ends; `detector` holds what every body of a stream does.
+`features` computes the quantities that events depend on from one body's joints, with their standard deviations.
+`trigger` turns a quantity into a condition that begins and ends. `detector` detects the events of all bodies of a
+stream.
 """

@@ -1,4 +1,4 @@
-"""What all bodies of one stream do; and the thresholds of it, ``[events]`` of a launch file, in SI units."""
+"""Detects the events of all bodies of one stream, with thresholds in SI units (``[events]`` of a launch file)."""
 
 from __future__ import annotations
 
@@ -18,66 +18,66 @@ from steadypose.prior.settings import check_range
 
 @dataclass(frozen=True)
 class EventSettings:
-    """When something begins; it ends beyond a second, laxer threshold, so that it does not flicker.
+    """Thresholds of events. A condition ends at a second, laxer threshold (the margin), so that it does not flicker.
 
-    Chosen on simulated streams, on the validation people of Bandai-Namco and on LAFAN1's subject 1
+    The values were chosen on simulated streams, on the validation people of Bandai-Namco and on LAFAN1's subject 1
     (``benchmarks/systems/events.py``).
     """
 
     confidence: float = 0.7
-    """probability, by the joints' standard deviations, that a threshold is crossed, from which on it counts as such"""
+    """Least probability that a threshold is crossed, computed from the joints' standard deviations."""
     hold: float = 0.07
-    """seconds for which a condition holds before it begins or ends"""
+    """Time for which a condition must hold before it begins or ends, seconds."""
     entered: float = 0.15
-    """seconds for which a body is followed before it has entered, and any of its events is published"""
+    """Time for which a body must be tracked before it has entered and its events are published, seconds."""
     left: float = 0.2
-    """seconds after which a body that is no longer followed has left"""
+    """Time after which a body that is no longer tracked has left, seconds."""
     near: float = 1.2
-    """metres on the floor from the sensor to the pelvis: nearer is near"""
+    """Largest horizontal distance from the sensor to the pelvis of a near body, metres."""
     near_margin: float = 0.2
-    """metres farther than ``near`` at which one no longer is"""
+    """Additional distance at which a body is no longer near, metres."""
     faces: float = 0.6
-    """radians between where the trunk faces and the sensor"""
+    """Largest angle between the trunk's heading and the direction of the sensor for a body that faces it, radians."""
     faces_margin: float = 0.2
-    """radians more, at which one no longer faces it"""
+    """Additional angle at which a body no longer faces the sensor, radians."""
     faces_turn: float = 0.3
-    """metres by which the line from right to left of hips and shoulders changes in a second, root mean square"""
+    """RMS change in one second of the line from right to left hips and shoulders, metres."""
     stands: float = 0.85
-    """height of the hips above the lower ankle, in lengths of the leg, from which on one stands"""
+    """Least height of the hips above the lower ankle of a standing body, leg lengths."""
     stands_margin: float = 0.2
-    """the same, less by which one no longer stands"""
+    """Reduction of that height at which a body no longer stands, leg lengths."""
     stands_change: float = 0.3
-    """lengths of the leg by which that height changes in a second, root mean square"""
+    """RMS change of that height in one second, leg lengths."""
     sits: float = 0.95
-    """radians of the more upright thigh from the vertical, from which on one sits"""
+    """Least angle of the more upright thigh from the vertical of a sitting body, radians."""
     sits_margin: float = 0.25
-    """radians less, at which one no longer sits"""
+    """Reduction of that angle at which a body no longer sits, radians."""
     lies: float = 0.65
-    """metres from the lowest to the highest of head, trunk, knees and feet, under which one lies"""
+    """Largest vertical extent of head, trunk, knees and feet of a lying body, metres."""
     lies_margin: float = 0.15
-    """metres more, at which one no longer lies"""
+    """Additional extent at which a body no longer lies, metres."""
     fell_speed: float = 1.2
-    """m/s downwards of the neck, on the way to lying, from which on it was a fall"""
+    """Least downward speed of the neck before lying that makes it a fall, m/s."""
     fell_within: float = 2.0
-    """seconds before lying in which that counts"""
+    """Time before lying in which that speed counts, seconds."""
     raised: float = 0.0
-    """metres of the fingertips above the neck from which on that hand is raised"""
+    """Least height of the fingertips above the neck of a raised hand, metres."""
     raised_margin: float = 0.08
-    """metres less, at which it no longer is"""
+    """Reduction of that height at which the hand is no longer raised, metres."""
     wave_swing: float = 0.45
-    """radians of the forearm, from side to side, that are a swing of a wave"""
+    """Least angle of the forearm's swing from side to side in a wave, radians."""
     wave_within: float = 0.8
-    """seconds in which the next swing comes; without it, the wave is over"""
+    """Longest time until the next swing, after which the wave is over, seconds."""
     point_elbow: float = 2.4
-    """radians of the elbow's inner angle from which on an arm is stretched out (pi is straight)"""
+    """Least inner angle of the elbow of a stretched arm, radians (pi is straight)."""
     point_elbow_margin: float = 0.25
-    """radians less, at which it no longer is"""
+    """Reduction of that angle at which the arm is no longer stretched, radians."""
     point_lift: float = 0.9
-    """radians between the arm and the vertical, up or down, from which on it points and does not hang or reach up"""
+    """Least angle between a pointing arm and the vertical, up or down, radians; otherwise it hangs or reaches up."""
     point_speed: float = 0.4
-    """m/s of a wrist, under which a stretched arm points"""
+    """Largest speed of the wrist of a pointing arm, m/s."""
     point_hold: float = 0.15
-    """seconds for which it does so before it points"""
+    """Time for which these conditions must hold before an arm points, seconds."""
 
     def __post_init__(self) -> None:
         check_range("[events] confidence", self.confidence, 0.5, 0.999)
@@ -89,15 +89,15 @@ class EventSettings:
 NOWHERE: NDArray[np.float64] = np.zeros(3)
 NOWHERE.flags.writeable = False
 SPEED_NS = 100_000_000
-"""over which a speed is measured: long enough for a centimetre of jitter to be 0.1 m/s"""
+"""Interval over which speeds are measured, nanoseconds; a centimetre of jitter then counts as 0.1 m/s."""
 UPRIGHT = 0.5
-"""height of the neck above the pelvis, in lengths of the trunk, under which nobody sits: 30 degrees above level"""
+"""Least height of the neck above the pelvis of a sitting body, trunk lengths: 30 degrees above the horizontal."""
 CERTAIN = 1e-6
-"""standard deviation of what is not computed from joints"""
+"""Standard deviation of quantities that are not computed from joints."""
 
 
 class EventDetector:
-    """Events of one stream of ``pose/world``, causal: each message's are found with the messages up to it.
+    """Detects the events of one ``pose/world`` stream causally, from the messages so far.
 
     Args:
         settings: the thresholds.
@@ -109,12 +109,12 @@ class EventDetector:
         self._stamp_ns = -1
 
     def update(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE) -> list[Event]:
-        """All that begins, holds or ends with the next message of the stream.
+        """Return all events that begin, continue or end with the next message of the stream.
 
         Args:
-            world: a message of ``pose/world``. One whose stamp is not after the last begins the stream anew.
-            sensor: (3,) metres, world: whom people come near to, and face. The origin unless given, over which an
-                uncalibrated sensor stands.
+            world: a message of ``pose/world``. A message whose stamp is not after the last starts the stream anew.
+            sensor: (3,) metres, world, the position that people come near to and face. The default is the origin, above
+                which an uncalibrated sensor is.
         """
         if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
             self._bodies.clear()
@@ -133,7 +133,7 @@ class EventDetector:
 
 
 class _Body:
-    """One body: what holds of it, and the last second and a half."""
+    """State of one body: its active conditions, and its last one and a half seconds."""
 
     def __init__(self, name: int, stamp_ns: int, settings: EventSettings) -> None:
         s = self._settings = settings
@@ -164,7 +164,7 @@ class _Body:
         self._arms: tuple[Arm, ...] = ()
 
     def update(self, stamp_ns: int, body: WorldBody, sensor: NDArray[np.float64]) -> Iterator[Event]:
-        """What begins, holds or ends at ``stamp_ns``."""
+        """Yield the events that begin, continue or end at ``stamp_ns``."""
         self.stamp_ns = stamp_ns
         seen = features(body, sensor)
         self._arms = seen.arms
@@ -182,7 +182,7 @@ class _Body:
                 yield self._event(key, Phase.ENDS)
 
     def leave(self, stamp_ns: int) -> Iterator[Event]:
-        """What ends with the body."""
+        """Yield the events that end when the body leaves."""
         if self._entered:
             for key, trigger in self._triggers.items():
                 if trigger.active:
@@ -196,7 +196,7 @@ class _Body:
         return Event(self._name, kind, phase, hand, trigger.confidence, direction, trigger.since_ns)
 
     def _changed(self, now: int, seen: Features) -> set[tuple[EventKind, Hand]]:
-        """Update all triggers; those that have changed."""
+        """Update all triggers, and return those that have changed."""
         s, none = self._settings, Hand.NONE
         changed: set[tuple[EventKind, Hand]] = set()
 
@@ -206,7 +206,7 @@ class _Body:
             return self._triggers[kind, hand].active
 
         lies = take(EventKind.LIES, none, -seen.extent.value, seen.extent.sigma)
-        upright = not seen.trunk < UPRIGHT  # nor if it is not known
+        upright = not seen.trunk < UPRIGHT  # also True if it is unknown
         sits = take(EventKind.SITS, none, *seen.thigh, possible=upright and not lies)
         (extension,), extension_sigma = self._extension.update(now, (seen.extension.value,), seen.extension.sigma)
         stands = take(EventKind.STANDS, none, extension, extension_sigma, possible=not lies and not sits)
@@ -232,7 +232,7 @@ class _Body:
         return changed
 
     def _fastest_fall(self, now: int, height: float) -> float:
-        """m/s: the greatest speed downwards of the neck in the time in which it counts."""
+        """Return the largest downward speed of the neck in the time that counts for a fall, m/s."""
         self._heights.append((now, height))
         while now - self._heights[0][0] > SPEED_NS:
             then, was = self._heights.popleft()
@@ -242,7 +242,7 @@ class _Body:
         return max((speed for _, speed in self._falls if not math.isnan(speed)), default=0.0)
 
     def _wrist_speeds(self, now: int, arms: tuple[Arm, Arm]) -> list[float]:
-        """m/s of both wrists."""
+        """Return the speeds of both wrists, m/s."""
         self._wrists.append((now, tuple(arm.wrist for arm in arms)))
         while len(self._wrists) > 2 and now - self._wrists[1][0] >= SPEED_NS:
             self._wrists.popleft()

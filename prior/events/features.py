@@ -1,7 +1,7 @@
-"""The quantities of one pose that show what its person does, each with its standard deviation.
+"""The quantities of a pose that events depend on, each with its standard deviation.
 
-All are differences of joints of the same body, in the world's z-up frame: no floor is needed, and a place in the world
-that drifts moves none of them but the distance to the sensor.
+All are differences between joints of the same body, in the z-up world frame. No floor is needed, and drift of the
+body's position affects only the distance to the sensor.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from steadypose.prior.body.skeleton import J
 
 Point = list[float]
 HAND = 0.18
-"""metres from wrist to fingertips of an adult (Drillis and Contini 1966: 0.108 of the stature)"""
+"""Distance from wrist to fingertips of an adult, metres (Drillis and Contini 1966: 0.108 of the stature)."""
 
 NARROW = 0.05
-"""Width in metres of hips and shoulders together, as seen from above, under which nobody knows where a body faces."""
+"""Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
 
 EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
 
 class Quantity(NamedTuple):
-    """An estimate and its standard deviation; NaN where a joint that it needs is not known."""
+    """An estimate and its standard deviation; NaN if a joint that it needs is unknown."""
 
     value: float
     sigma: float
@@ -37,51 +37,51 @@ class Arm(NamedTuple):
     """One arm."""
 
     raised: Quantity
-    """metres of the fingertips above the neck, by the forearm's direction"""
+    """Height of the fingertips above the neck, from the forearm's direction, metres."""
     elbow: Quantity
-    """radians, the inner angle: pi is straight"""
+    """Inner angle, radians; pi is straight."""
     lift: float
-    """radians between shoulder to wrist and the nearer vertical"""
+    """Angle between the line from shoulder to wrist and the nearer vertical, radians."""
     swing: float
-    """radians of the forearm from upright, towards the body's left; NaN where it is not observed, for guesses shake"""
+    """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, because guesses shake."""
     up: bool
-    """the hand is no lower than the chest"""
+    """Whether the hand is at least as high as the chest."""
     upright: bool
-    """the same, and the forearm points up"""
+    """Whether, in addition, the forearm points up."""
     wrist: Point
-    """(3,) metres, world"""
+    """(3,) metres, world."""
     direction: NDArray[np.float64]
-    """(3,) unit vector, world, from the head through the wrist: of the lines that say where somebody points, the
-    nearest to the truth (Nickel and Stiefelhagen 2007)"""
+    """(3,) unit vector, world, from the head through the wrist: the most accurate line of pointing (Nickel and
+    Stiefelhagen 2007)."""
 
 
 class Features(NamedTuple):
-    """One body at one moment."""
+    """Quantities of one body at one time."""
 
     distance: Quantity
-    """metres on the floor from sensor to pelvis"""
+    """Horizontal distance from sensor to pelvis, metres."""
     to_sensor: tuple[float, float]
-    """(2,) metres on the floor from the pelvis to the sensor"""
+    """(2,) horizontal vector from the pelvis to the sensor, metres."""
     across: tuple[float, float]
-    """(2,) metres on the floor from right to left, hips and shoulders together; a body faces a right angle to it"""
+    """(2,) horizontal vector from right to left, hips and shoulders together, metres, normal to the heading."""
     across_sigma: float
-    """metres, of each of the two"""
+    """Standard deviation of each component of `across`, metres."""
     extension: Quantity
-    """height of the hips above the lower ankle, in lengths of the leg"""
+    """Height of the hips above the lower ankle, leg lengths."""
     thigh: Quantity
-    """radians of the more upright thigh from hanging straight down"""
+    """Angle of the more upright thigh from straight down, radians."""
     extent: Quantity
-    """metres from the lowest to the highest of head, trunk, knees and feet"""
+    """Vertical extent of head, trunk, knees and feet, metres."""
     neck: float
-    """metres, its height in the world"""
+    """Height of the neck in the world, metres."""
     trunk: float
-    """height of the neck above the pelvis, in lengths of the trunk"""
+    """Height of the neck above the pelvis, trunk lengths."""
     arms: tuple[Arm, Arm]
-    """left and right"""
+    """Left and right arm."""
 
 
 def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
-    """Of one body, as seen from a sensor at (3,) metres, world."""
+    """Compute the features of one body, relative to a sensor at (3,) metres, world."""
     known = body.state != JointState.UNKNOWN
     observed: list[bool] = np.isin(body.state, (JointState.SEEN, JointState.REFINED)).tolist()
     p: list[Point] = np.where(known[:, None], body.positions, np.nan).tolist()
@@ -121,7 +121,7 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
 
 
 def facing_away(across: Sequence[float], sigma: float, to_sensor: Sequence[float]) -> Quantity:
-    """Radians between where a body faces, whose left lies along ``across``, and the sensor; all on the floor."""
+    """Horizontal angle between a body's heading and the sensor, radians; the body's left is along ``across``."""
     width, far = math.hypot(*across), math.hypot(*to_sensor)
     if far < 1e-6 or not width > NARROW:
         return Quantity(math.nan, math.nan)
@@ -130,7 +130,7 @@ def facing_away(across: Sequence[float], sigma: float, to_sensor: Sequence[float
 
 
 def _away(body: WorldBody, to_sensor: Sequence[float]) -> Quantity:
-    """Metres on the floor from the sensor to the pelvis."""
+    """Horizontal distance from the sensor to the pelvis, metres."""
     (x, y), c = to_sensor, body.covariance
     far = math.hypot(x, y)
     if far < 1e-6:
@@ -178,7 +178,7 @@ def _distance(a: Point, b: Point) -> float:
 
 
 def _angle_to_up(start: Point, end: Point) -> float:
-    """Radians between ``start`` to ``end`` and the vertical."""
+    """Angle between the line from ``start`` to ``end`` and the vertical, radians."""
     length = math.dist(start, end)
     return math.acos(max(-1.0, min(1.0, (end[2] - start[2]) / length))) if length > 1e-6 else math.nan
 

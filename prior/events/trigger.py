@@ -1,5 +1,7 @@
-"""Conditions that begin and end: by two thresholds, a time that they must hold, and the uncertainty of their value; and
-whether a raised hand waves, which is when its forearm swings to one side and back, and again.
+"""Conditions that begin and end, and the detection of waves.
+
+A condition has two thresholds (hysteresis), a time that it must hold, and takes account of its value's uncertainty. A
+raised hand waves if its forearm swings to one side and back, and again.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ NEVER = -1
 
 
 def probability_above(value: float, sigma: float, threshold: float) -> float:
-    """That a quantity with this estimate and standard deviation is above a threshold."""
+    """Return the probability that a quantity with this estimate and standard deviation exceeds a threshold."""
     if math.isnan(value):
         return 0.0
     return 0.5 * math.erfc((threshold - value) / (max(sigma, 1e-9) * math.sqrt(2.0)))
@@ -22,14 +24,14 @@ class Trigger:
 
     Args:
         on: the threshold.
-        margin: how far below it the condition ends.
-        hold_s: seconds that either side must last.
-        confidence: probability that a threshold is crossed, from which on it counts as such.
+        margin: distance below it at which the condition ends.
+        hold_s: seconds for which a crossing must last.
+        confidence: least probability that a threshold is crossed.
 
     Attributes:
-        active: whether it holds.
-        since_ns: when it began to, by capture: the first moment of those that it was seen to hold.
-        confidence: probability that the value is above the middle between both thresholds.
+        active: whether the condition holds.
+        since_ns: capture time at which it began: the first time at which it was observed to hold.
+        confidence: probability that the value is above the midpoint of both thresholds.
     """
 
     def __init__(self, on: float, margin: float, hold_s: float, confidence: float) -> None:
@@ -41,13 +43,13 @@ class Trigger:
         self.confidence = 0.0
 
     def update(self, stamp_ns: int, value: float, sigma: float, possible: bool = True) -> bool:
-        """Take the next value; whether the condition has begun or ended with it.
+        """Process the next value; returns whether the condition has begun or ended.
 
         Args:
-            stamp_ns: of the value.
-            value: NaN where it is not known: nothing begins or ends then.
+            stamp_ns: stamp of the value.
+            value: the value; if it is NaN, nothing begins or ends.
             sigma: its standard deviation.
-            possible: whether all else that the condition needs holds.
+            possible: whether the condition's other requirements hold.
         """
         self.confidence = probability_above(value, sigma, 0.5 * (self._on + self._off))
         doubt = self._sigmas * sigma
@@ -67,18 +69,18 @@ class Trigger:
 
 
 SWINGS = 2
-"""Number of swings of a wave: out and back, and once more where it is not about upright, for so an arm that is raised
-aside and lowered again begins as well."""
+"""Number of swings of a wave: out and back. If the swing is not about upright, one more is needed, because an arm that
+is raised to the side and lowered also starts like this."""
 CENTRED = 0.4
-"""Angle in radians of the middle of a swing, or of its last part, from upright, up to which it is about upright."""
+"""Largest angle from upright of the middle of a swing, or of its last part, for a swing about upright, radians."""
 
 
 class Wave:
-    """The turning points of a forearm's swing; one counts once the forearm has come back from it by a swing.
+    """Detects waves from the turning points of a forearm. One counts when the forearm has returned from it by a swing.
 
     Args:
-        swing: radians that it comes back.
-        within_s: seconds in which the next turning point comes.
+        swing: angle of the return, radians.
+        within_s: longest time until the next turning point, seconds.
     """
 
     def __init__(self, swing: float, within_s: float) -> None:
@@ -92,10 +94,10 @@ class Wave:
         self._side = self._turns = self._turned_ns = 0
 
     def update(self, stamp_ns: int, angle: float, upright: bool, up: bool) -> bool:
-        """Whether it waves, with the forearm's next angle in radians to one side of upright.
+        """Process the forearm's next angle to one side of upright, radians; returns whether it waves.
 
-        It begins while the forearm is ``upright``, and goes on while the hand is ``up``: who waves with the whole arm
-        comes near level at each end. Where the angle is NaN, as of an arm that is not observed, nothing swings.
+        A wave begins while the forearm is ``upright``, and continues while the hand is ``up``, because in a wave with
+        the whole arm, the forearm is almost horizontal at each end. An angle of NaN (an unobserved arm) is no swing.
         """
         if not (up if self._turns else upright):
             self._reset()
@@ -125,11 +127,12 @@ class Wave:
 
 
 class RandomWalk:
-    """A Kalman filter of what a sensor shakes by more than people change it, each of its coordinates alike: the
-    surer the observations, the less it waits for the next ones.
+    """A random-walk Kalman filter of a quantity that a sensor shakes by more than people change it.
+
+    All coordinates are filtered alike. The more accurate the observations, the less it averages.
 
     Args:
-        change: by which a coordinate changes in a second, root mean square, in its unit.
+        change: RMS change of a coordinate in one second, in its unit.
     """
 
     def __init__(self, change: float) -> None:
@@ -137,7 +140,7 @@ class RandomWalk:
         self._stamp_ns, self._value, self._variance = NEVER, (math.nan,), math.inf
 
     def update(self, stamp_ns: int, value: tuple[float, ...], sigma: float) -> tuple[tuple[float, ...], float]:
-        """The coordinates and their standard deviation, with the next observation of them; NaN where unknown."""
+        """Update with the next observation; returns the coordinates and their standard deviation; NaN if unknown."""
         if any(map(math.isnan, value)):
             self._stamp_ns = NEVER
             return value, math.nan

@@ -45,8 +45,8 @@ FAULT_SHARE = 0.3
 """Kinds of tracking faults among the observed joints, and share of windows with one."""
 
 BONE_SIGMA, TURN_SIGMA = 0.05, 0.2
-"""Standard deviations of the augmentation `vary_builds`: of the logarithm of bone lengths, and of rotations, radians.
-There are only 22 people to train on."""
+"""Standard deviations of the augmentation `vary_builds`: of the logarithm of bone lengths, and (at most) of rotations,
+radians. There are only 22 people to train on."""
 
 
 def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[CompletionNet]:
