@@ -30,7 +30,7 @@ MIN_SCALE = 1e-4
 """Term added to each normalised squared innovation; it limits the noise to at least 1 % of `MEASUREMENT_SIGMA`."""
 
 HELD, SETTLED = 3, 4
-"""Frames after which a missing joint leaves the body, and for which a joint must be observed to join it, frames."""
+"""Numbers of frames for which a joint must be missing to leave the body, and observed to join it."""
 
 MIN_EIGENVALUE = 1e-5
 """Least eigenvalue of a mode relative to the joints' mean variance, because no mode is rigid."""
