@@ -144,7 +144,7 @@ class Bench:
     def recurrent(self) -> recurrent.RecurrentDenoiser:
         """Train the whole-body denoiser."""
         track = partial(self.progress.track, description="recurrent denoiser")
-        return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else recurrent.STEPS, 0, track)
+        return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else 3000, 0, track)
 
 
 class Answer(NamedTuple):

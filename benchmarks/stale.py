@@ -1,7 +1,6 @@
 """Results that are kept although what they measured has changed since, each with the reason."""
 
 STALE = {
-    "ablations": "noisy joints, whose conditions it shares, has another baseline since; the conditions are the same",
-    "scale": "measured before results recorded the pipeline's output; to be measured again",
+    "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""

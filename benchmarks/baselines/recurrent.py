@@ -22,10 +22,7 @@ from steadypose.prior.body.skeleton import MIRROR, J
 
 _WIDTH = 256
 _SCALE = 5.0  # units per metre in the network
-STEPS = 6000
-"""Number of optimiser steps. With the batch, in clips, and a clip's length, in frames, as many as the product's mixture
-had."""
-_BATCH, _FRAMES = 32, 90
+_BATCH, _FRAMES = 32, 60
 _JOINTS = len(MIRROR)
 
 
