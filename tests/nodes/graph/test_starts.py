@@ -116,7 +116,7 @@ def test_a_damaged_recording_is_played_and_the_exit_status_says_so(begin: Any, r
     run: Run = begin("--input", str(recording), *INPUT_ALONE)
     status, output = run.wait()
     assert status == 1, output
-    assert "could be read of the input was played" in output.splitlines()[-1]
+    assert "the readable part of the input was played" in output.splitlines()[-1]
 
 
 def test_poses_go_on_where_the_log_cannot_be_written(begin: Any, recording: Path, tmp_path: Path, folder: Path) -> None:
