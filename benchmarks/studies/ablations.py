@@ -31,7 +31,7 @@ from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
-from steadypose.benchmarks.systems.workload import numpy_ms
+from steadypose.benchmarks.workload import numpy_ms
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.bones import PersonSettings
 from steadypose.prior.clean.fuse import FuseSettings

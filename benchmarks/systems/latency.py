@@ -25,7 +25,7 @@ from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.provenance import ROOT, WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.systems.running import START_S, running
-from steadypose.benchmarks.systems.workload import numpy_ms
+from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody

@@ -22,7 +22,7 @@ from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.systems.latency import LATEST_MS, RECORDING, WARM_UP, WARM_UP_S, crowd, percentiles, recorded
 from steadypose.benchmarks.systems.running import START_S, running_nodes
-from steadypose.benchmarks.systems.workload import numpy_ms
+from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import PoseRaw

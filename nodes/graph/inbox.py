@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import zmq
 
+from steadypose.msgs.subscriber import REVIVE_S
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
@@ -16,8 +17,6 @@ READ_AHEAD = 64
 """Largest number of messages that a node takes off a socket before it processes one."""
 LONGEST = 512
 """Largest number of waiting messages of one publisher, over all its streams."""
-LOOK_S = 0.5
-"""Interval at which an idle subscriber is polled, seconds. Polling also repairs its connections."""
 DEADLINE_NS = 50_000_000
 """Longest time a frame waits in a node's queue while newer frames of its stream arrive, nanoseconds.
 
@@ -88,14 +87,17 @@ class Inbox:
         return None
 
     def _fill(self, timeout_s: float) -> None:
-        """Read the sockets that are ready. Polling every subscriber would cost more than processing a message."""
+        """Read the sockets that are ready. Reading every subscriber would cost more than processing a message.
+
+        The others are read at times, because a subscriber repairs its connections while it is read.
+        """
         ready = dict(self._poller.poll(round(timeout_s * 1000)))
         now_ns = self._clock.monotonic_ns()
         for queue in self._queues:
-            if queue.socket in ready or now_ns - queue.filled_ns > LOOK_S * 1e9:
+            if timeout_s > 0 or queue.socket not in ready:
+                queue.empty_ns = now_ns  # nothing had arrived before the wait, which the first arrival ends
+            if queue.socket in ready or now_ns - queue.filled_ns > REVIVE_S * 1e9:
                 queue.fill(0)
-            else:
-                queue.empty_ns = now_ns
 
 
 class _Received(NamedTuple):
@@ -151,7 +153,7 @@ class _Queue:
             late = min(waited_ns, newest.message.stamp_ns - before[0].message.stamp_ns) > DEADLINE_NS
             if late or len(before) >= limit:
                 self._drop(before if late else before[:1])
-        elif len(self.waiting) > LONGEST:
+        if len(self.waiting) > LONGEST:
             self._drop([next(frame for frame in self.waiting if _is_frame(frame.message))])
 
     def _drop(self, frames: list[_Received]) -> None:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import zmq
 from conftest import VirtualClock, raw, walk, walking
 
 from steadypose.msgs.topics import POSE_RAW
@@ -63,6 +64,25 @@ def test_frames_that_come_late_together_are_all_worked_on(clock: VirtualClock) -
         worked += inbox.next(0) is not None
         clock.time_ns += 8_000_000
     assert (worked, inbox.overrun) == (5, 0)
+
+
+def test_a_server_that_waited_for_them_processes_all(clock: VirtualClock, monkeypatch: pytest.MonkeyPatch) -> None:
+    arrival_ns = clock.time_ns + 10**8
+    frames = [(arrival_ns, raw(k, stamp_ns=arrival_ns + k * FRAME_NS)) for k in range(3)]
+
+    class Poller:
+        """Waits for the frames, by the test's clock."""
+
+        def register(self, *_: object) -> None: ...
+
+        def poll(self, timeout_ms: int) -> list[tuple[int, int]]:
+            clock.time_ns = max(clock.time_ns, arrival_ns) if timeout_ms else clock.time_ns
+            return [(0, zmq.POLLIN)] if clock.time_ns >= arrival_ns else []
+
+    monkeypatch.setattr(zmq, "Poller", Poller)
+    inbox = Inbox([Line(clock, frames), Line(clock, [])], limit=8, clock=clock)  # type: ignore[list-item]
+    assert [inbox.next(1.0) is not None for _ in range(4)] == [True, True, True, False]
+    assert inbox.overrun == 0
 
 
 def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
