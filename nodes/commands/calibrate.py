@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
 from steadypose.nodes.commands.calibrate_files import (
-    depth_picture,
+    depth_image,
     lens_of,
     read_depth,
+    read_images,
     read_launch,
-    read_pictures,
     save_calibration,
     write_floor_grid,
-    write_picture,
+    write_image,
 )
 from steadypose.nodes.commands.calibrate_sensor import CalibrateSensor
 from steadypose.nodes.sources.registry import InputSettings
@@ -46,7 +46,7 @@ GOOD_SIGMA_M = 0.005
 """a place less sure than this is worth another try"""
 DPI = 300
 LaunchFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
-Pictures = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PICTURE ...")]
+Images = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE ...")]
 FloorPicture = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 _MARGIN_MM = 8.0
 _INCH_MM = 25.4
@@ -90,7 +90,7 @@ class PrintBoard:
         with matplotlib.rc_context({"pdf.fonttype": 42}):
             page = Figure(figsize=(width / _INCH_MM, height / _INCH_MM), facecolor="white")
             axes = page.add_axes((left / width, bottom / height, across / width, up / height))
-            axes.imshow(board.picture(100), cmap="gray", interpolation="none", aspect="auto")
+            axes.imshow(board.image(100), cmap="gray", interpolation="none", aspect="auto")
             axes.set_axis_off()
             words = f"world (0, 0)   x →   {board.columns} x {board.rows}, print at 100 %: a square is {square:g} mm"
             page.text(left / width, 0.3 * bottom / height, words, fontsize=7, family="monospace", color="0.4")
@@ -108,19 +108,19 @@ class CalibrateLens:
     step 'oak' instead.
 
     Try:
-      steadypose calibrate lens kitchen.toml pictures/ --square 0.0561
+      steadypose calibrate lens kitchen.toml images/ --square 0.0561
       steadypose calibrate lens kitchen.toml video.mp4 --square 0.0561
 
     Args:
         launch: your launch file of this camera; the result is written to its [input.calibration].
-        pictures: image files, folders of them, or videos, of which two images per second are used.
+        images: image files, folders of them, or videos, of which two images per second are used.
         square: side of a square in metres, measured on the print.
         columns: squares along the lower edge.
         rows: squares along the left edge.
     """
 
     launch: LaunchFile
-    pictures: Pictures
+    images: Images
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
@@ -128,22 +128,22 @@ class CalibrateLens:
     def run(self) -> None:
         read_launch(self.launch)
         board = Board(self.columns, self.rows, self.square)
-        views, sizes, pictures = [], set(), 0
-        for name, picture in read_pictures(self.pictures):
-            pictures += 1
-            view = find_corners(picture, board)
+        views, sizes, images = [], set(), 0
+        for name, image in read_images(self.images):
+            images += 1
+            view = find_corners(image, board)
             print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
-            sizes.add(picture.shape[1::-1])
+            sizes.add(image.shape[1::-1])
             views += [view] if view else []
         if len(sizes) > 1:
             raise CalibrationError(
-                f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
+                f"expected images of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
             )
         lens = calibrate_lens(views, sizes.pop())
         save_calibration(self.launch, lens=lens)
         angle = 2 * np.degrees(np.arctan(0.5 * lens.size[0] / lens.focal[0]))
         print(
-            f"\nlens from {len(views)} of {pictures} pictures, {lens.error_px:.2f} pixels off on average "
+            f"\nlens from {len(views)} of {images} images, {lens.error_px:.2f} pixels off on average "
             "(0.5 is good); "
             f"{lens.size[0]} x {lens.size[1]}, focal length {lens.focal[0]:.1f} pixels, {angle:.0f} degrees wide"
         )
@@ -164,7 +164,7 @@ class CalibratePose:
 
     Args:
         launch: your launch file of this camera, with the lens; the pose is written to its [input.calibration].
-        pictures: image files, folders of them, or videos.
+        images: image files, folders of them, or videos.
         square: side of a square in metres, measured on the print.
         columns: squares along the lower edge.
         rows: squares along the left edge.
@@ -172,7 +172,7 @@ class CalibratePose:
     """
 
     launch: LaunchFile
-    pictures: Pictures
+    images: Images
     square: float = Board.square
     columns: int = Board.columns
     rows: int = Board.rows
@@ -182,17 +182,17 @@ class CalibratePose:
         lens = lens_of(self.launch)
         board = Board(self.columns, self.rows, self.square)
         views, last = [], None
-        for name, picture in read_pictures(self.pictures):
-            if picture.shape[1::-1] != lens.size:
+        for name, image in read_images(self.images):
+            if image.shape[1::-1] != lens.size:
                 raise CalibrationError(
                     f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
-                    f"{picture.shape[1]} x {picture.shape[0]}"
+                    f"{image.shape[1]} x {image.shape[0]}"
                 )
-            view, last = find_corners(picture, board), picture
+            view, last = find_corners(image, board), image
             print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
             views += [view] if view else []
         found = camera_pose(views, lens)
-        assert last is not None, "without a picture there is no pose"
+        assert last is not None, "without an image there is no pose"
         write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), last, lens, found.pose)
         save_calibration(self.launch, pose=found.pose)
         print(
@@ -200,7 +200,7 @@ class CalibratePose:
             f"sure to {1e3 * found.sigma_m:.1f} mm and {np.degrees(found.sigma_rad):.2f} degrees"
         )
         if found.sigma_m > GOOD_SIGMA_M:
-            print("More pictures, a larger board, or the board nearer to the camera would make it more certain.")
+            print("More images, a larger board, or the board nearer to the camera would make it more certain.")
         print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
 
@@ -234,7 +234,7 @@ class CalibrateFloor:
         if not np.isfinite(self.up).all() or not np.linalg.norm(self.up) > 0:
             raise CalibrationError(f"--up: expected a direction, got {self.up}")
         pose, share = floor_pose(points_of_depth(depth, lens), np.array(self.up))
-        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), depth_picture(depth), lens, pose)
+        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), depth_image(depth), lens, pose)
         save_calibration(self.launch, pose=pose)
         print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
         print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
@@ -267,16 +267,16 @@ class CalibrateOak:
         self._write(still)
 
     def _write(self, still: Still) -> None:
-        picture, depth = self.out.with_name(f"{self.out.name}.png"), self.out.with_name(f"{self.out.name}.depth.png")
-        write_picture(picture, still.colour)
-        write_picture(depth, still.depth)
+        image, depth = self.out.with_name(f"{self.out.name}.png"), self.out.with_name(f"{self.out.name}.depth.png")
+        write_image(image, still.colour)
+        write_image(depth, still.depth)
         height, width = still.depth.shape
         focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
         lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
         save_calibration(self.launch, lens=lens)
         up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
         print(f"{self.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
-        print(f"  steadypose calibrate pose {self.launch} {picture} --square METRES")
+        print(f"  steadypose calibrate pose {self.launch} {image} --square METRES")
         print(f"without it:\n  steadypose calibrate floor {self.launch} {depth}{up}")
 
 

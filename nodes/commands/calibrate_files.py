@@ -1,4 +1,4 @@
-"""Files of `calibrate`: pictures, read and drawn with the floor that was found, and the launch file that is written."""
+"""Files of `calibrate`: images, read and drawn with the floor that was found, and the launch file that is written."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from steadypose.prior.camera.calibration import (
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_STEP_S = 0.5
-"""between the pictures taken from a video: nearer ones show the same again"""
+"""between the images taken from a video: nearer ones show the same again"""
 MAX_PICTURES = 60
 AXIS_PX = 4
 Image = NDArray[np.uint8]
 
 
-def read_pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
+def read_images(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
     """Pictures by name, from files, folders and videos.
 
     Raises:
@@ -46,22 +46,20 @@ def read_pictures(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
         elif path.is_file():
             files.append(path)
         else:
-            raise CalibrationError(f"{path} does not exist: expected a picture, a folder of pictures, or a video")
+            raise CalibrationError(f"{path} does not exist: expected an image, a folder of images, or a video")
     if not files:
         where = f" in {', '.join(map(str, paths))}" if paths else ""
-        raise CalibrationError(
-            f"expected pictures ({', '.join(PICTURES)}), folders of them, or videos; got none{where}"
-        )
+        raise CalibrationError(f"expected images ({', '.join(PICTURES)}), folders of them, or videos; got none{where}")
     if len(files) > MAX_PICTURES:
-        print(f"of {len(files)} pictures the first {MAX_PICTURES} are taken")
+        print(f"of {len(files)} images the first {MAX_PICTURES} are taken")
     for file in track(files[:MAX_PICTURES], "reading", disable=len(files) < 2):
         if file.suffix.lower() in VIDEOS:
             yield from _frames(file)
             continue
-        picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if picture is None:
-            raise CalibrationError(f"{file}: expected a picture that OpenCV reads, such as .png or .jpg")
-        yield file.name, np.asarray(picture, np.uint8)
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise CalibrationError(f"{file}: expected an image that OpenCV reads, such as .png or .jpg")
+        yield file.name, np.asarray(image, np.uint8)
 
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
@@ -97,17 +95,17 @@ def read_depth(file: Path) -> NDArray[np.integer]:
     return np.asarray(depth, np.int64)
 
 
-def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0, step: float = 0.5) -> Image:
-    """A picture (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
+def draw_floor(image: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0, step: float = 0.5) -> Image:
+    """An image (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
 
     Args:
-        picture: grey.
+        image: grey.
         lens: of the camera.
         pose: of the camera in the world.
         reach: metres of grid around the point that the camera looks at, or stands above.
         step: metres between lines.
     """
-    drawn = np.ascontiguousarray(np.repeat(picture[:, :, None], 3, axis=2))
+    drawn = np.ascontiguousarray(np.repeat(image[:, :, None], 3, axis=2))
     turn = Rotation.from_quat(pose.orientation)
     forward = turn.apply([0.0, 0.0, 1.0])
     away = min(pose.position[2] / -forward[2], reach) if forward[2] < 0 else reach
@@ -142,25 +140,25 @@ def draw_floor(picture: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0,
     return drawn
 
 
-def depth_picture(depth: NDArray[np.integer]) -> Image:
+def depth_image(depth: NDArray[np.integer]) -> Image:
     """Depth (H, W) in millimetres as grey, near light and far dark, as inverse depth is seen; black in holes."""
     near = np.percentile(depth[depth > 0], 1) if depth.any() else 1.0
     return (255 * np.clip(near / np.where(depth > 0, depth, np.inf), 0.0, 1.0)).astype(np.uint8)
 
 
-def write_picture(out: Path, picture: NDArray[Any]) -> None:
+def write_image(out: Path, image: NDArray[Any]) -> None:
     try:
-        written = cv2.imwrite(str(out), picture)
+        written = cv2.imwrite(str(out), image)
     except cv2.error:  # an ending it does not know
         written = False
     if not written:
         raise CalibrationError(
-            f"{out} cannot be written: expected a picture such as .png or .jpg in a folder that exists"
+            f"{out} cannot be written: expected an image such as .png or .jpg in a folder that exists"
         )
 
 
-def write_floor_grid(out: Path, picture: Image, lens: Intrinsics, pose: Pose) -> None:
-    write_picture(out, draw_floor(picture, lens, pose))
+def write_floor_grid(out: Path, image: Image, lens: Intrinsics, pose: Pose) -> None:
+    write_image(out, draw_floor(image, lens, pose))
     print(f"{out}: the floor's grid, half a metre a square; it must lie on the floor, its axes where the world begins")
 
 

@@ -160,7 +160,7 @@ def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> 
 
 
 def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
-    """Write the residuals, as arrays and as a picture."""
+    """Write the residuals, as arrays and as a plot."""
     arrays: dict[str, Any] = {"joint_names": np.array(JOINTS), "unit": np.array(unit)}
     for number, (body, stamps, misfit, track) in enumerate(fits):
         arrays |= {f"{number}/body_id": np.array(body), f"{number}/stamp_ns": stamps, f"{number}/misfit": misfit}

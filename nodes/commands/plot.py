@@ -1,4 +1,4 @@
-"""``steadypose plot``: what happened in a recording, as one picture, or as a video.
+"""``steadypose plot``: what happened in a recording, as one plot, or as a video.
 
 Panels that a recording has nothing for are left out, so that one of `pose/raw` alone is drawn too. One body is
 drawn, the one seen the longest unless another is asked for; the trajectory over the floor is that of all of them.

@@ -87,7 +87,7 @@ class Board:
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker * self.square, dictionary)
 
-    def picture(self, pixels_per_square: int) -> Image:
+    def image(self, pixels_per_square: int) -> Image:
         """Return the pattern for printing, (rows * pixels, columns * pixels), without a margin."""
         return np.asarray(
             self.pattern.generateImage((self.columns * pixels_per_square, self.rows * pixels_per_square)), np.uint8
@@ -136,12 +136,12 @@ class Intrinsics:
         return np.array([*self.distortion, *[0.0] * (5 - len(self.distortion))])
 
 
-def find_corners(picture: Image, board: Board) -> Corners | None:
+def find_corners(grey: Image, board: Board) -> Corners | None:
     """Detect the board's corners in an image (H, W) or (H, W, 3); None if too few are visible."""
     detector = cv2.aruco.CharucoDetector(board.pattern)
     points, image = np.zeros((0, 3)), np.zeros((0, 2))
     for finer in (1, 2):  # enlarging helps to read small markers; large corners are detected better without it
-        enlarged = cv2.resize(picture, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
+        enlarged = cv2.resize(grey, None, fx=finer, fy=finer, interpolation=cv2.INTER_CUBIC)
         corners, ids, _, _ = detector.detectBoard(enlarged)
         if ids is not None and len(ids) > len(points):
             on_board, on_image = board.pattern.matchImagePoints(corners, ids)  # pyright: ignore
@@ -172,8 +172,8 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
     while True:
         if len(kept) < MIN_VIEWS:
             raise CalibrationError(
-                f"expected {MIN_VIEWS} pictures or more that show the board well, got {len(kept)}: take 15 to 25, "
-                "the board near and far, tilted to all sides, in the middle and in every corner of the picture"
+                f"expected {MIN_VIEWS} images or more that show the board well, got {len(kept)}: take 15 to 25, "
+                "the board near and far, tilted to all sides, in the middle and in every corner of the image"
             )
         error, matrix, distortion, turns, _, sigma, _, errors = cv2.calibrateCameraExtended(
             [view.board.astype(np.float32) for view in kept],
@@ -190,7 +190,7 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
     if not error < MAX_RMS_PX:
         raise CalibrationError(
             f"expected corners within {MAX_RMS_PX:g} pixels of where the lens puts them, got {error:.1f}: is the "
-            "board flat, the number of squares as printed, and every picture from the same camera and resolution?"
+            "board flat, the number of squares as printed, and every image from the same camera and resolution?"
         )
     focal = matrix[[0, 1], [0, 1]]
     unsure = float((np.ravel(sigma)[:2] / focal).max())
@@ -198,7 +198,7 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
     tilt = float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0).min()))
     if tilt < MIN_TILT or not unsure < MAX_FOCAL_SIGMA:
         raise CalibrationError(
-            f"expected pictures that determine the focal length to {MAX_FOCAL_SIGMA:.0%}, with the board tilted by "
+            f"expected images that determine the focal length to {MAX_FOCAL_SIGMA:.0%}, with the board tilted by "
             f"{np.degrees(MIN_TILT):.0f} degrees or more from one to another, got {unsure:.1%} and "
             f"{np.degrees(tilt):.0f} degrees: they are too much alike; tilt the board to all sides, near and far"
         )
@@ -234,7 +234,7 @@ def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
         CalibrationError: there is no image, or the corners do not fit one pose of the board.
     """
     if not views:
-        raise CalibrationError("expected a picture that shows the board on the floor, got none with enough corners")
+        raise CalibrationError("expected an image that shows the board on the floor, got none with enough corners")
     points = np.concatenate([view.board for view in views])
     image = np.concatenate([view.image for view in views])
     # a distant plane has two poses that look almost the same: take the better one of those above the floor
@@ -250,7 +250,7 @@ def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:
     if not best.error_px < MAX_RMS_PX:
         raise CalibrationError(
             f"expected the corners within {MAX_RMS_PX:g} pixels of one place of the board, got {best.error_px:.1f}: "
-            "camera and board must not move between the pictures, and the lens must be of this camera and resolution"
+            "camera and board must not move between the images, and the lens must be of this camera and resolution"
         )
     return best
 

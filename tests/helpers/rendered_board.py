@@ -57,7 +57,7 @@ def picture(pose: Pose, lens: Intrinsics, looks: Floats, rng: np.random.Generato
         reach = np.where(turned[..., 2] < 0, -pose.position[2] / turned[..., 2], np.nan)
     floor = pose.position[:2] + turned[..., :2] * reach[..., None]
     margin = _PIXELS_PER_SQUARE // 2
-    paper = np.pad(BOARD.picture(_PIXELS_PER_SQUARE), margin, constant_values=255)
+    paper = np.pad(BOARD.image(_PIXELS_PER_SQUARE), margin, constant_values=255)
     per_metre = _PIXELS_PER_SQUARE / BOARD.square
     x = floor[..., 0] * per_metre + margin - 0.5
     y = (BOARD.size[1] - floor[..., 1]) * per_metre + margin - 0.5

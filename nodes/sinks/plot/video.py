@@ -263,13 +263,13 @@ def _write_mp4(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> i
     writer: Any = None
     count = 0
     for frame in frames:
-        picture = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2, ::-1]
+        image = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2, ::-1]
         if writer is None:
             codec = cv2.VideoWriter.fourcc(*"vp09")  # plays in browsers; pip's OpenCV has no H.264
-            writer = cv2.VideoWriter(str(path), codec, fps, picture.shape[1::-1])
+            writer = cv2.VideoWriter(str(path), codec, fps, image.shape[1::-1])
             if not writer.isOpened():
                 raise PlotError(f"{path}: this OpenCV cannot write VP9; write a .gif")
-        writer.write(np.ascontiguousarray(picture))
+        writer.write(np.ascontiguousarray(image))
         count += 1
     if writer is not None:
         writer.release()

@@ -72,7 +72,7 @@ def test_corners_lie_where_the_world_says() -> None:
 def test_what_shows_no_board_has_no_corners() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (200, 300), dtype=np.uint8)
     assert find_corners(noise, BOARD) is None
-    board = cv2.copyMakeBorder(BOARD.picture(40), 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=(255,))
+    board = cv2.copyMakeBorder(BOARD.image(40), 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=(255,))
     assert find_corners(np.asarray(board, np.uint8), BOARD) is not None
     assert find_corners(np.asarray(board[:, ::-1], np.uint8).copy(), BOARD) is None, "a mirror image is no board"
 
@@ -90,7 +90,7 @@ def test_the_lens_is_found_though_in_one_picture_the_board_was_bent() -> None:
 def test_too_few_pictures_and_pictures_at_odds_are_refused() -> None:
     rng = np.random.default_rng(0)
     views = [view(pose, rng) for pose, _ in zip(held_poses(rng), range(8), strict=False)]
-    with pytest.raises(CalibrationError, match="8 pictures or more"):
+    with pytest.raises(CalibrationError, match="8 images or more"):
         calibrate_lens(views[:7], LENS.size)
     with pytest.raises(CalibrationError, match="of where the lens puts them"):
         calibrate_lens([dataclasses.replace(v, image=rng.uniform(0, 700, v.image.shape)) for v in views], LENS.size)
