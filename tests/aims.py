@@ -1,4 +1,4 @@
-"""Which tests are aimed at a place of the code: by what they import, and by the functions that run it."""
+"""Finds the tests of a piece of code: by what test files import, and by which functions run it."""
 
 from __future__ import annotations
 
@@ -7,41 +7,48 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-ROOMS = ("msgs", "prior", "training", "nodes", "benchmarks")
+FOLDERS = ("msgs", "prior", "training", "nodes", "benchmarks")
 
 
-def aimed_at(file: Path, root: Path) -> list[str]:
-    """Test files, relative to ``root``, aimed at a file of the package.
+def tests_of_module(file: Path, root: Path) -> list[str]:
+    """Return the test files that import a file's module or, if none does, a module that imports it.
+
+    If some of these are in the folder of the file's own tests (``tests/prior/fit`` for ``prior/fit``), only those.
+
+    Args:
+        file: file of the package, relative to ``root``, as are the results.
+        root: folder of the checkout.
 
     Raises:
-        ValueError: no test imports the file's module, nor what imports it.
+        ValueError: no test imports the module, even through others.
     """
     modules = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
-        for room in ROOMS
-        for path in (root / room).rglob("*.py")
+        for folder in FOLDERS
+        for path in (root / folder).rglob("*.py")
     }
     tests = {path: _imports(path) for path in sorted((root / "tests").rglob("test_*.py"))}
     sought, seen = {name for name, path in modules.items() if path == root / file}, set()
     while sought:
         found = [path for path, names in tests.items() if names & sought]
         if near := [path for path in found if (root / "tests" / file).parent in path.parents]:
-            found = near  # those of the same room, where there are any
+            found = near
         if found:
             return [str(path.relative_to(root)) for path in found]
         seen |= sought
         sought = {name for name, path in modules.items() if name not in seen and _imports(path) & sought}
-    raise ValueError(f"{file}: expected a module of the package that a test imports, if only by another")
+    raise ValueError(f"{file}: expected a module that a test imports, directly or through others")
 
 
-def of_room(file: Path, root: Path) -> list[str]:
-    """Test files, relative to ``root``, of the room of a file."""
+def tests_in_folder(file: Path, root: Path) -> list[str]:
+    """Return the test files in the folder of a file's own tests; both are relative to ``root``."""
     return [str(path.relative_to(root)) for path in sorted((root / "tests" / file.parent).glob("test_*.py"))]
 
 
 @cache
 def _imports(path: Path) -> set[str]:
-    """Names without ``steadypose.``: of modules, and of what is taken from them."""
+    """Return the modules of the package that a file imports, and the names that it imports from them, without
+    ``steadypose.``"""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose."):
@@ -51,15 +58,16 @@ def _imports(path: Path) -> set[str]:
 
 
 class Part(NamedTuple):
-    """A function, a method, a constant, or what a module does as it is imported.
+    """A part of a module: a function, a method, a class, a constant, or another statement.
 
     Attributes:
         file: relative to the checkout.
-        first, last: lines from 1, decorators included.
-        ran: the first line of the function that runs it, 1 of a module.
-        names: that it defines; of a method, none.
+        first, last: first and last line, from 1, including decorators.
+        ran: first line of the function that Python reports when it runs this part; 1 for the module's own statements.
+        names: names that it defines; none for a method.
         uses: names that it mentions.
-        is_run: whether Python runs it; otherwise it is compiled, or a value, and shows in those that use it.
+        is_run: whether Python reports that it runs. Constants and compiled loops (njit) are not reported: a change of
+            theirs is found in the functions that use them.
     """
 
     file: Path
@@ -73,9 +81,9 @@ class Part(NamedTuple):
 
 @cache
 def parts(root: Path) -> list[Part]:
-    """All of the package; in a file, what is at a line comes before the module or class about it."""
+    """Return all parts of the package; in each file, the methods of classes come before the classes."""
     found = []
-    for file in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
+    for file in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.py")):
         tree = ast.parse(file.read_text())
         within = [child for node in tree.body if isinstance(node, ast.ClassDef) for child in node.body]
         for node in (*within, *tree.body):
@@ -95,7 +103,7 @@ def parts(root: Path) -> list[Part]:
 
 
 def _names(node: ast.AST) -> set[str]:
-    """Names in a part of the code; of a class without its methods."""
+    """Return the names in a part of the code; for a class, without its methods."""
     if isinstance(node, ast.ClassDef):
         inner = [child for child in node.body if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)]
         return set[str]().union(*map(_names, (*node.bases, *node.decorator_list, *inner)))
@@ -104,7 +112,7 @@ def _names(node: ast.AST) -> set[str]:
 
 
 def runs_of(file: Path, line: int, root: Path) -> set[tuple[str, int]]:
-    """Files and first lines of the code that runs, or uses, what is at a line of a file."""
+    """Return file and first line of the functions that run the code at a line, or use it if it is a value."""
     every = parts(root)
     waiting = [next(p for p in every if p.file == file and p.first <= line <= p.last)]
     found, seen = set[tuple[str, int]](), set[Part]()

@@ -1,11 +1,14 @@
 """Mutation testing: ``python -m tests.mutation FOLDER_OR_FILE... [--tests TESTS] [--sample N] [--seed S]``.
 
-A mutant is the code with one operator, number, order or statement changed. Tests that pass on a mutant do not hold that
-place: it survived, and is printed. Unless tests are named, a mutant meets those of its room and those aimed at its
-file: the ones that import it, or where none does, that import the modules that import it; none that is marked slow. Of
-these it meets the files that run the changed function, the quickest first. The checkout stays as it is: mutants live in
-a copy. Exit status 0 if at least `GOAL` of the mutants were killed, and 1 if fewer were, or if the tests fail without
-any mutation.
+A mutant is a copy of the code with one small change: another operator or number, two arguments exchanged, or a
+statement left out. Tests that fail on it kill it. If all of them pass, it survives: no test checks what was changed
+there. Each mutant is printed as killed or survived.
+
+Unless ``--tests`` names the tests, each mutant is tested by the test files in the folder of its file, such as
+``tests/prior/fit`` for ``prior/fit``, and by those that import its module, or, if none does, import a module that
+imports it. Only those that run the changed function are run, the fastest first, without tests marked slow. Mutants are
+written to a temporary copy of the checkout. The exit status is 0 if at least `GOAL` of the mutants were killed, and 1
+if fewer were, or if the tests fail on the unchanged code.
 """
 
 from __future__ import annotations
@@ -30,10 +33,12 @@ from types import FrameType
 from typing import NamedTuple
 
 import pytest
-from tests.aims import aimed_at, of_room, runs_of
+from tests.aims import FOLDERS, runs_of, tests_in_folder, tests_of_module
 
 ROOT = Path(__file__).parents[1]
 GOAL = 0.85
+"""Least share of mutants that tests should kill."""
+
 LIBRARIES = [
     "hypothesis",
     "mcap",
@@ -45,9 +50,11 @@ LIBRARIES = [
     "torch",
     "zmq",
 ]
+"""Imported once, before the processes that run tests are forked."""
+
 ELSEWHERE = shutil.ignore_patterns(".venv", ".git", ".uv", ".hypothesis", "__pycache__", ".*_cache")
 MADE = ("build", "data", "runs", "out")
-"""Folders at the top of a checkout that hold no code; further down, one of these names does."""
+"""Names of folders without code at the top of a checkout. Further down, folders of these names have code."""
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -56,8 +63,10 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
 }  # fmt: skip
 SYMMETRIC = {"max", "min", "maximum", "minimum", "fmax", "fmin", "hypot"}
-"""Functions of two values in any order."""
+"""Functions whose arguments may be exchanged."""
+
 LOOPS = ROOT / "src" / "steadypose" / "__pycache__" / "loops_of_mutants"
+"""Cache of numba's compiled loops."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +109,8 @@ def mutants(file: Path, root: Path = ROOT) -> list[Mutant]:
 
 
 def _mutable(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
-    """Nodes of a tree, but not in annotations, imports and f-strings, whose parts have no place of their own."""
+    """Yield the nodes of a tree that may be changed: none in annotations, decorators and imports, nor in f-strings, for
+    whose parts Python 3.11 gives no positions."""
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list"):
             continue
@@ -112,7 +122,10 @@ def _mutable(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
 
 
 def _the_same_either_way(node: ast.AST, child: ast.AST) -> bool:
-    """Of exceptions the order does not count, that of indices is no order of values, and -2 is as unknown as -1."""
+    """Whether a change of ``child`` in ``node`` is left out.
+
+    The order of exceptions has no effect, and that of indices is no order of values. Of -1, only the sign is changed.
+    """
     return (isinstance(node, ast.ExceptHandler | ast.Subscript) and isinstance(child, ast.Tuple)) or (
         isinstance(node, ast.UnaryOp) and isinstance(child, ast.Constant)
     )
@@ -152,7 +165,7 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def copy_checkout(source: Path, target: Path) -> None:
-    """All that tests of a checkout need, and nothing that they make."""
+    """Copy what the tests of a checkout need, without data, results and caches."""
 
     def left_out(folder: str, names: list[str]) -> set[str]:
         return {*ELSEWHERE(folder, names), *(MADE if Path(folder) == source else ())}
@@ -161,18 +174,19 @@ def copy_checkout(source: Path, target: Path) -> None:
 
 
 def passes(tests: Sequence[str], root: Path, limit_s: float | None = None, record: Path | None = None) -> bool:
-    """Whether the tests pass on the copy of the checkout at ``root``; those that do not end in time do not.
+    """Return whether the tests pass on the copy of the checkout at ``root``. Tests that take too long fail.
 
     Args:
-        tests: as pytest takes them.
-        root: of the copy.
-        limit_s: seconds that they may take.
-        record: a file for what they run: JSON of files and first lines of functions.
+        tests: arguments of pytest.
+        root: folder of the copy.
+        limit_s: time limit, seconds; None for no limit.
+        record: file to which to write the functions that the tests ran, JSON pairs of file and first line; None if they
+            are not needed.
 
     Raises:
-        ValueError: there are no such tests.
+        ValueError: pytest finds no such tests.
     """
-    # forked from a process that has the libraries already: to import them takes longer than most tests
+    # fork from a process that has already imported the libraries, because importing them takes longer than most tests
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(LIBRARIES)
     child = context.Process(target=_run, args=(tests, root, record))
@@ -191,7 +205,7 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     os.chdir(root)
     sys.path[:0] = [str(root), str(root / "src")]
-    # no bytecode: two mutants of one second and one size would be taken for one another
+    # no bytecode, because Python would mistake a mutant for the last one if both have the same size and second
     sys.dont_write_bytecode = True
     os.environ |= {"PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
     os.environ.setdefault("NUMBA_CACHE_DIR", str(LOOPS))  # only loops that are changed are compiled
@@ -211,31 +225,33 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
     sys.exit(status)
 
 
-class Met(NamedTuple):
-    """What a test file does without any mutation.
+class Unchanged(NamedTuple):
+    """A run of a test file on the unchanged code.
 
     Attributes:
-        seconds: that it takes.
-        ran: files and first lines of functions.
+        seconds: duration.
+        ran: file and first line of each function that it ran.
     """
 
     seconds: float
     ran: list[list[str | int]]
 
 
-def _digest(path: Path) -> str:
-    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+def _digest(*paths: Path) -> str:
+    files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 def main() -> int:
-    """Mutate, test, count."""
+    """Draw mutants, test them, and print the share that was killed."""
     parser = ArgumentParser("python -m tests.mutation", description=__doc__)
     parser.add_argument("code", nargs="+", type=Path, help="files, or folders of them")
-    parser.add_argument("--tests", nargs="+", help="what pytest is to run; those aimed at each file if left out")
-    parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all of them if left out")
+    parser.add_argument("--tests", nargs="+", help="arguments of pytest; if omitted, chosen for each mutant")
+    parser.add_argument("--sample", type=int, help="number of mutants, drawn at random; all if omitted")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kept", type=Path, help="a file for what unchanged tests run, made by the first call with it")
+    parser.add_argument(
+        "--kept", type=Path, help="file that keeps which functions each test file runs, for later calls"
+    )
     options = parser.parse_args()
     paths = [path.resolve() for path in options.code]
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
@@ -245,28 +261,29 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         root, record = Path(temporary).resolve() / "checkout", Path(temporary) / "ran.json"
         copy_checkout(ROOT, root)
-        survived, met_before = 0, dict[str, Met]()
+        code = _digest(*(root / folder for folder in FOLDERS))
+        survived, unchanged = 0, dict[str, Unchanged]()
         if options.kept and options.kept.is_file():
-            met_before = {key: Met(*value) for key, value in json.loads(options.kept.read_text()).items()}
+            unchanged = {key: Unchanged(*value) for key, value in json.loads(options.kept.read_text()).items()}
         for mutant in drawn:
-            tests = options.tests or [*aimed_at(mutant.file, ROOT), *of_room(mutant.file, ROOT)]
-            known = {test: f"{test} {_digest(root / test.partition('::')[0])}" for test in tests}
+            tests = options.tests or [*tests_of_module(mutant.file, ROOT), *tests_in_folder(mutant.file, ROOT)]
+            known = {test: f"{test} {_digest(root / test.partition('::')[0])} {code}" for test in tests}
             for test, key in known.items():
-                if key not in met_before:
+                if key not in unchanged:
                     started = time.monotonic()
                     if not passes([test], root, record=record):
-                        sys.exit(f"the tests fail without any mutation, nothing can be said of them: {test}")
-                    met_before[key] = Met(time.monotonic() - started, json.loads(record.read_text()))
+                        sys.exit(f"{test} fails on the unchanged code, so it can say nothing of mutants")
+                    unchanged[key] = Unchanged(time.monotonic() - started, json.loads(record.read_text()))
                     if options.kept:
-                        options.kept.write_text(json.dumps(met_before))
-            seconds = {test: met_before[key].seconds for test, key in known.items()}
+                        options.kept.write_text(json.dumps(unchanged))
+            seconds = {test: unchanged[key].seconds for test, key in known.items()}
             changed = [list(place) for place in runs_of(mutant.file, mutant.line, ROOT)]
-            # what runs in other processes is not recorded
-            met = [test for test, key in known.items() if any(place in met_before[key].ran for place in changed)]
-            met = sorted(met or known, key=seconds.__getitem__)
+            chosen = [test for test, key in known.items() if any(place in unchanged[key].ran for place in changed)]
+            # if none is known to run the function, run all: what runs in other processes is not recorded
+            chosen = sorted(chosen or known, key=seconds.__getitem__)
             original = (root / mutant.file).read_bytes()
             (root / mutant.file).write_bytes(mutant.source)
-            alive = passes(met, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in met))
+            alive = passes(chosen, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in chosen))
             (root / mutant.file).write_bytes(original)
             survived += alive
             print("survived" if alive else "killed  ", mutant, flush=True)
