@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from steadypose.benchmarks.baselines.filters import missing
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean.fuse import FuseSettings
-from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.reconstruct import DenoiseSettings
-from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
-from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import (
+    DenoiseSettings,
+    FuseSettings,
+    ImputeSettings,
+    OrientSettings,
+    PriorSettings,
+    RefineSettings,
+    ScoreSettings,
+)
 
 PRODUCT: Mapping[str, PriorSettings] = {
     "HM-VAE": PriorSettings(

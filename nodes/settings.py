@@ -3,22 +3,56 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from steadypose import PACKAGE
+from steadypose.prior.settings import MODEL
+
 _PATH = "path"
+STREAMS = "sim_data"
+"""Folder of the bundled streams."""
 
 
 class LaunchError(ValueError):
     """A launch file or a command line's setting that cannot be used. The text says what to do."""
 
 
-def path_setting(metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """A field for a path. A relative path in a launch file is relative to that file."""
-    return field(default="", metadata={_PATH: True, **metadata})
+@contextmanager
+def launch_errors() -> Iterator[None]:
+    """Raise invalid settings and missing weights as `LaunchError`."""
+    try:
+        yield
+    except LaunchError:
+        raise
+    except (ValueError, FileNotFoundError) as error:
+        raise LaunchError(str(error)) from error
+
+
+def path_setting(metadata: Mapping[str, Any] = MappingProxyType({}), bundled: str = "") -> Any:
+    """A field for a path. A relative path in a launch file is relative to that file.
+
+    Args:
+        metadata: further metadata of the field.
+        bundled: a folder of this package whose files can be given by name alone, see `located`.
+    """
+    return field(default="", metadata={_PATH: bundled, **metadata})
+
+
+def located(name: str, folder: Path, bundled: str) -> Path:
+    """The path of a file: ``name`` relative to ``folder``, or else the file of that name that is in the package.
+
+    Args:
+        name: path or name; ``~`` is the home folder.
+        folder: the folder that relative paths are relative to.
+        bundled: a folder of this package, such as ``sim_data``; empty if its files have no names.
+    """
+    path, own = folder / Path(name).expanduser(), PACKAGE / bundled / name
+    return own if bundled and Path(name).name == name and own.exists() and not path.exists() else path
 
 
 def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
@@ -31,8 +65,9 @@ def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
     """
     for setting in fields(settings):
         value = table.get(setting.name)
-        if setting.metadata.get(_PATH) and isinstance(value, str) and value:
-            table[setting.name] = str(folder / Path(value).expanduser())
+        is_path = _PATH in setting.metadata or (MODEL in setting.metadata and str(value).endswith(".safetensors"))
+        if is_path and isinstance(value, str) and value:
+            table[setting.name] = str(located(value, folder, setting.metadata.get(_PATH, "")))
         elif isinstance(section := setting.default_factory, type) and is_dataclass(section) and isinstance(value, dict):
             resolve_paths(section, value, folder)
 

@@ -6,14 +6,20 @@ import difflib
 import logging
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from functools import cache
 from typing import Any, get_args, get_type_hints
 
 logger = logging.getLogger(__name__)
 
+MODEL = "model"
+"""Key of the metadata of a field that names weights; its value is the model's name."""
+
 RENAMED = {"prior.encode": "prior.reconstruct", "prior.bones": "prior.person", "server.kiosks": "server.clients"}
 """Former names of settings in version 0.2. Version 0.3 accepts them with a warning; 0.4 refuses them."""
+
+UNUSED = {"prior.impute": ("steps", "rate")}
+"""Settings in version 0.2, ignored with a warning. Gradient ascent in the latents gained nothing."""
 
 
 def current_key(path: str) -> str:
@@ -27,7 +33,7 @@ def current_key(path: str) -> str:
 
 
 def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a launch file's section under their current names.
+    """Return the settings of a launch file's section under their current names, without those no longer used.
 
     Raises:
         ValueError: a setting is given under both names.
@@ -37,6 +43,9 @@ def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         name = current_key(f"{section}.{key}").rpartition(".")[2] if f"{section}.{key}" in RENAMED else key
         if name != key and name in settings:
             raise ValueError(f"[{section}] {key} is the former name of {name}: expected one of the two")
+        if unused := [k for k in UNUSED.get(f"{section}.{key}", ()) if isinstance(value, Mapping) and k in value]:
+            _warn_of_unused(f"{section}.{key}", ", ".join(unused))
+            value = {k: v for k, v in value.items() if k not in unused}
         current[name] = value
     return current
 
@@ -50,8 +59,18 @@ def _warn_of_former_name(old: str, new: str) -> None:
     )
 
 
+@cache
+def _warn_of_unused(section: str, keys: str) -> None:
+    logger.warning("[%s] %s: no longer used, and to be refused by a later version", section, keys)
+
+
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
     """Build a settings dataclass from a mapping, strictly; nested dataclasses from nested mappings.
+
+    Args:
+        cls: the dataclass.
+        settings: its values.
+        path: the section's name, such as ``prior.gate``; empty for a whole launch file.
 
     Raises:
         ValueError: a key is unknown or a type wrong; the message says what was expected and what was given.
@@ -63,24 +82,29 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"expected one of {', '.join(known)}"
-            raise ValueError(f"[{path}] has no setting '{key}': {hint}")
-        default = getattr(defaults, key)
+            raise ValueError(f"{f'[{path}]' if path else 'a launch file'} has no setting '{key}': {hint}")
+        default, name = getattr(defaults, key), f"[{path}] {key}" if path else key
         if is_dataclass(default):
             if not isinstance(value, Mapping):
-                raise ValueError(f"[{path}] {key}: expected a section, got {value!r}")
-            values[key] = build_settings(type(default), value, f"{path}.{key}")
+                raise ValueError(f"{name}: expected a section, got {value!r}")
+            values[key] = build_settings(type(default), value, f"{path}.{key}".lstrip("."))
             continue
         wanted = float if isinstance(default, float) else type(default)
         if isinstance(value, bool) != isinstance(default, bool) or not isinstance(
             value, (int, float) if wanted is float else wanted
         ):
-            raise ValueError(f"[{path}] {key}: expected {wanted.__name__} such as {default!r}, got {value!r}")
+            raise ValueError(f"{name}: expected {wanted.__name__} such as {default!r}, got {value!r}")
         if wanted is float and not math.isfinite(value):
-            raise ValueError(f"[{path}] {key}: expected a finite number such as {default!r}, got {value!r}")
+            raise ValueError(f"{name}: expected a finite number such as {default!r}, got {value!r}")
         if isinstance(value, (list, dict)) and (kind := _kind_of_items(cls, key)) is not None:
-            _check_items(f"[{path}] {key}", value, kind)
+            _check_items(name, value, kind)
         values[key] = wanted(value)  # type: ignore[arg-type]  (it is of that type)
     return cls(**values)
+
+
+def weights_setting(model: str, default: str = "default") -> Any:
+    """A field for a model's weights: a weight set, or a path to a ``.safetensors`` file; empty for none."""
+    return field(default=default, metadata={MODEL: model})
 
 
 def check_range(name: str, value: float, least: float, most: float) -> None:

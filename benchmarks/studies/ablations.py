@@ -33,15 +33,18 @@ from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.benchmarks.workload import numpy_ms
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean.bones import PersonSettings
-from steadypose.prior.clean.fuse import FuseSettings
-from steadypose.prior.clean.gate import GateSettings
-from steadypose.prior.clean.impute import ImputeSettings
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.reconstruct import DenoiseSettings
-from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
-from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import (
+    DenoiseSettings,
+    FuseSettings,
+    GateSettings,
+    ImputeSettings,
+    OrientSettings,
+    PersonSettings,
+    PriorSettings,
+    RefineSettings,
+    ScoreSettings,
+)
 from steadypose.prior.models.mixture import inference
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings

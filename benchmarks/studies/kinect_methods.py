@@ -22,8 +22,7 @@ from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip,
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.sensor_error import CorrectSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import CorrectSettings, PriorSettings
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes.sensor_bias import train_correction

@@ -53,8 +53,7 @@ from steadypose.prior.body.kinematics import (
 )
 from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.rotations import OrientSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import OrientSettings, PriorSettings
 from steadypose.prior.models.posture import RootCovariance, trunk_frame
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs

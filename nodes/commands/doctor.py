@@ -94,7 +94,7 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
     clock = clock or SystemClock()
     launch = Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
-    settings = PriorSettings.from_dict(launch.table("prior"))
+    settings = launch.settings(PriorSettings)
     check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
     addresses = launch.addresses("pose_input")
     reported: dict[str, str] = {}

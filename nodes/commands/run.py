@@ -23,13 +23,14 @@ from steadypose.nodes.commands.output import printable
 from steadypose.nodes.commands.run_table import line, table
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
-from steadypose.nodes.graph.launch import Launch, check_settings, in_launch_file
+from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER
 from steadypose.nodes.graph.process import ALIVE, READY, STOPPING, notify, stop_on_signals
 from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, RunLock, losses, write_health
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
+from steadypose.nodes.settings import STREAMS, located
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 
@@ -65,13 +66,16 @@ def run(
         view: serve a 3D view for a browser, and print its address.
         settings: override a setting of the launch file. A unique end of its name is enough: delay=2. Repeatable.
     """
-    overrides = in_launch_file(settings)
+    overrides = in_launch_file(launch, settings)
     if input is not None and input.suffix.lower() in VIDEOS:
         launch = "webcam" if launch == REPLAY else launch
         overrides += ['input.source="webcam"', f"input.webcam.video={_toml(input.resolve())}"]
         overrides.append("transport.lossless=true")  # a video can wait
     elif input is not None:
-        overrides += ['input.source="recording"', f"input.recording={_toml(input.resolve())}"]
+        overrides += [
+            'input.source="recording"',
+            f"input.recording={_toml(located(str(input), Path.cwd(), STREAMS).resolve())}",
+        ]
     if rate is not None:
         overrides.append(f"input.rate={rate}")
     if loop:
@@ -88,8 +92,6 @@ def run(
         overrides.append(f"recorder.directory={_toml(changed)}")
         settled = Launch.read(launch, overrides)
         console.print(f"recording to {printable(str(changed))}: the folder asked for is there already", soft_wrap=True)
-    if settings:
-        check_settings(settled.sections)
     _check(settled)
     arguments = ["--launch", launch]
     for override in overrides:

@@ -2,9 +2,8 @@
 
 A launch file is TOML with one section per subject, and is read strictly: an unknown key is an error that names the
 nearest known one. Every section is optional; with the defaults the nodes run but play no input. `nodes.graph.topology`
-declares the sections of nodes. ``[prior]`` and ``[trajectory]`` are passed unchanged to the pipelines
-(`prior.clean.settings.PriorSettings`, `prior.world.settings.TrajectorySettings`), which check them just as strictly.
-On the command line, ``--set delay=2`` means ``prior.delay``, because no other setting's name ends in ``delay``.
+declares the sections of nodes. On the command line, ``--set delay=2`` means ``prior.delay``, because no other setting's
+name ends in ``delay``.
 """
 
 from __future__ import annotations
@@ -27,8 +26,9 @@ from steadypose.nodes.graph.topology import (
     add_node,
     load,
 )
-from steadypose.nodes.settings import LaunchError, load_plugin, resolve_paths
+from steadypose.nodes.settings import LaunchError, launch_errors, load_plugin, resolve_paths
 from steadypose.prior.body.layouts import add_layouts
+from steadypose.prior.models.weights import check_weights
 from steadypose.prior.settings import build_settings, current_key, current_keys, nearest
 
 if sys.version_info >= (3, 11):
@@ -89,19 +89,15 @@ class Launch(_EveryLaunch):
         file = find(path)
         table = read_toml(file)
         resolve_paths(_layout(table), table, file.parent)
-        try:
+        with launch_errors():
             table = {name: current_keys(name, part) if isinstance(part, dict) else part for name, part in table.items()}
             for override in overrides:
                 apply_override(table, override)
             _add_plugins(table.get("plugins", {}))
-            whole = build_settings(_layout(table), table, file.name)
+            whole = build_settings(_layout(table), table, "")
             sections = {name: getattr(whole, name) for name in table.keys() & _sections().keys()}
             add_layouts(whole.skeletons)
             return cls(whole.nodes, whole.transport, whole.server, whole.skeletons, whole.plugins, sections)
-        except LaunchError:
-            raise
-        except ValueError as error:
-            raise LaunchError(str(error)) from error
 
     def settings(self, kind: type[Settings]) -> Settings:
         """The settings of the node that declares this dataclass: its section in the file, or the defaults."""
@@ -221,11 +217,14 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     table[key] = value
 
 
-PIPELINES = {
-    "prior": "steadypose.prior.clean.settings:PriorSettings",
-    "trajectory": "steadypose.prior.world.pipeline:TrajectorySettings",
+PIPELINES = ("prior", "trajectory")
+"""Sections of the two pipelines that `clean` runs."""
+
+_SECTIONS_OF_ALL = {
+    "transport": "steadypose.nodes.graph.topology:TransportSettings",
+    "server": "steadypose.nodes.graph.topology:ServerSettings",
 }
-"""Settings dataclasses (``module:name``) of the sections that nodes parse themselves, by section."""
+"""Settings dataclass (``module:name``) of each section that belongs to no node."""
 
 
 def full_key(override: str, sections: Mapping[str, type]) -> str:
@@ -254,43 +253,54 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
     if any(key.startswith(f"{name}.") or name.startswith(f"{key}.") for key in known):
         return f"{name}={value}"  # a whole table, or a key inside a free-form table
     near = nearest(name, [*known, *(key.partition(".")[2] for key in known)])
-    raise LaunchError(f"--set {name}: no such setting{near}; sections are {', '.join(sections)}")
+    raise LaunchError(f"--set {name}: no such setting{near or '; sections are ' + ', '.join(sections)}")
 
 
 def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check the settings of both pipelines without loading weights.
+    """Check the settings of both pipelines without loading them.
 
     Raises:
-        LaunchError: a setting does not exist, or its value is invalid.
+        LaunchError: a setting does not exist, its value is invalid, or there are no such weights.
     """
-    for section, kind in PIPELINES.items():
-        try:
-            load(kind).from_dict(settings.get(section, {}))
-        except ValueError as error:
-            raise LaunchError(str(error)) from error
+    with launch_errors():
+        for section, kind in pipeline_sections().items():
+            check_weights(kind.from_dict(settings.get(section, {})))
+
+
+def check_weights_of(launch: Launch) -> None:
+    """Check, before nodes start, that the weights of both pipelines exist.
+
+    Raises:
+        LaunchError: there are no such weights.
+    """
+    with launch_errors():
+        for section in launch.sections.keys() & {*PIPELINES}:
+            check_weights(launch.sections[section])
 
 
 def pipeline_sections() -> dict[str, type]:
     """Settings dataclasses of the two pipelines that `clean` runs, by section."""
-    return {section: load(kind) for section, kind in PIPELINES.items()}
+    return {section: load(NODES[section].settings) for section in PIPELINES}
 
 
-def in_launch_file(overrides: Sequence[str]) -> list[str]:
-    """Apply `full_key` over all sections of a launch file. Overrides that begin with a section are left unchanged.
+def in_launch_file(launch: str | Path, overrides: Sequence[str]) -> list[str]:
+    """Apply `full_key` over all sections of a launch file. It imports only what it needs.
 
     Raises:
         LaunchError: as `full_key`.
     """
-    declared = {node.section: node.settings for node in NODES.values() if node.section}
-    first = {*declared, *(setting.name for setting in fields(Launch))}
-    if all(override.partition("=")[0].partition(".")[0].strip() in first for override in overrides):
-        return list(overrides)  # avoids importing the libraries of every node
-    sections = pipeline_sections() | {section: load(kind) for section, kind in declared.items() if kind}
-    sections |= {"transport": TransportSettings, "server": ServerSettings}
-    return [
-        override if override.partition("=")[0].partition(".")[0].strip() in first else full_key(override, sections)
-        for override in overrides
-    ]
+    if overrides:
+        _add_plugins(read_toml(find(launch)).get("plugins", {}))
+    kinds = {setting.name: "" for setting in fields(_EveryLaunch)} | _SECTIONS_OF_ALL | _sections()
+    full = []
+    for override in overrides:
+        first = current_key(override.partition("=")[0].strip()).partition(".")[0]
+        if kinds.get(first) == "":  # free-form
+            full.append(override)
+        else:
+            named = [first] if first in kinds else [name for name in kinds if kinds[name]]
+            full.append(full_key(override, {name: load(kinds[name]) for name in named}))
+    return full
 
 
 def _keys(kind: type) -> Iterator[str]:

@@ -51,7 +51,8 @@ def compile_from_the_end() -> None:
     from steadypose.prior.body.inverse_kinematics import fit_lengths, solve_pose
     from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS
     from steadypose.prior.clean.frame import Estimate
-    from steadypose.prior.clean.rotations import Orient, OrientSettings
+    from steadypose.prior.clean.rotations import Orient
+    from steadypose.prior.clean.settings import OrientSettings
     from steadypose.prior.models.hgvae.faults import LiveFaultNet
     from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
     from steadypose.prior.models.hgvae.inference import LiveHGVAE

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import Any
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
@@ -15,7 +14,7 @@ from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import launch_errors
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
@@ -34,22 +33,8 @@ def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
     Raises:
         LaunchError: a setting is unknown, its value is invalid, or weights are missing.
     """
-    with _launch_errors():
+    with launch_errors():
         return PriorPipeline(PriorSettings.from_dict(settings))
-
-
-def make_batch(settings: Mapping[str, Any], clients: int) -> StreamBatch:
-    """Create the prior of several clients; raises as `make_prior`."""
-    with _launch_errors():
-        return StreamBatch(PriorSettings.from_dict(settings), clients)
-
-
-@contextmanager
-def _launch_errors() -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, FileNotFoundError) as error:
-        raise LaunchError(str(error)) from error
 
 
 class PriorNode(Node):
@@ -60,14 +45,13 @@ class PriorNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        settings, clients = launch.table("prior"), len(launch.server.clients)
-        with _launch_errors():
-            load_loops(PriorSettings.from_dict(settings))  # first, so that the pipeline reuses the memory it frees
-        self._pipeline = make_batch(settings, clients) if clients else make_prior(settings)
+        settings, clients = launch.settings(PriorSettings), len(launch.server.clients)
+        with launch_errors():
+            load_loops(settings)  # first, so that the pipeline reuses the memory it frees
+            self._pipeline = StreamBatch(settings, clients) if clients else PriorPipeline(settings)
         self._bodies = 0
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters)
-        settings = PriorSettings.from_dict(launch.table("prior"))
         self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=clients or 1)
         self._started_ns = self.clock.now_ns()
         self._limit = BodyLimit(settings.max_bodies, self.clock)

@@ -93,12 +93,16 @@ _NODES: dict[str, NodeDeclaration] = {
         publishes=(POSE_CLEAN,),
         subscribes={"pose_input": (POSE_RAW, DIAGNOSTICS)},
         section="prior",
+        settings="steadypose.prior.clean.settings:PriorSettings",
+        preflight="steadypose.nodes.graph.launch:check_weights_of",
     ),
     "trajectory": NodeDeclaration(
         node="steadypose.nodes.graph.trajectory_node:TrajectoryNode",
         publishes=(POSE_WORLD,),
         subscribes={"prior": (POSE_CLEAN,), "pose_input": (DIAGNOSTICS,)},
         section="trajectory",
+        settings="steadypose.prior.world.settings:TrajectorySettings",
+        preflight="steadypose.nodes.graph.launch:check_weights_of",
     ),
     "events": NodeDeclaration(
         node="steadypose.nodes.graph.events_node:EventsNode",

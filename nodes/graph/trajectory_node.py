@@ -11,7 +11,7 @@ from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import launch_errors
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -22,10 +22,8 @@ def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
     Raises:
         LaunchError: a setting is unknown, its value is invalid, or weights are missing.
     """
-    try:
+    with launch_errors():
         return TrajectoryPipeline(TrajectorySettings.from_dict(settings))
-    except (ValueError, FileNotFoundError) as error:
-        raise LaunchError(str(error)) from error
 
 
 class TrajectoryNode(Node):
@@ -36,7 +34,9 @@ class TrajectoryNode(Node):
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
         one_thread()
-        self._pipeline = make_trajectory(launch.table("trajectory"))
+        self._settings = launch.settings(TrajectorySettings)
+        with launch_errors():
+            self._pipeline = TrajectoryPipeline(self._settings)
         self._client_pipelines: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
@@ -54,7 +54,7 @@ class TrajectoryNode(Node):
         clients = len(self.launch.server.clients)
         if not clients:
             return self._pipeline
-        pipeline = self._client_pipelines.pop(source, None) or make_trajectory(self.launch.table("trajectory"))
+        pipeline = self._client_pipelines.pop(source, None) or TrajectoryPipeline(self._settings)
         self._client_pipelines[source] = pipeline
         if len(self._client_pipelines) > clients:  # a client reconnected under another name
             del self._client_pipelines[next(iter(self._client_pipelines))]

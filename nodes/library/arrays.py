@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from steadypose.nodes.driving import NOBODY, OfflineRun, Settings
 from steadypose.nodes.extras import require_extra
+from steadypose.nodes.graph.launch import check_settings
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.settings import LaunchError
@@ -70,7 +71,7 @@ def sections(settings: Settings | None, delay: int) -> Settings:
     """The sections ``prior`` and ``trajectory``; a delay in ``settings`` takes precedence over ``delay``.
 
     Raises:
-        LaunchError: ``settings`` has another section.
+        LaunchError: ``settings`` has another section, or a setting cannot be used.
     """
     given = dict(settings or {})
     for section in given.keys() - {"prior", "trajectory"}:
@@ -79,7 +80,9 @@ def sections(settings: Settings | None, delay: int) -> Settings:
             f"settings: expected sections 'prior' and 'trajectory', each with its settings, such as "
             f"{{'prior': {{'delay': 2}}}}; got {section!r}{hint}"
         )
-    return {"prior": {"delay": delay} | dict(given.get("prior", {})), "trajectory": given.get("trajectory", {})}
+    both = {"prior": {"delay": delay} | dict(given.get("prior", {})), "trajectory": given.get("trajectory", {})}
+    check_settings(both)
+    return both
 
 
 def skeleton_name(skeleton: SkeletonLike) -> str:
@@ -193,9 +196,10 @@ def clean(
     Warns:
         InputWarning: units, axes or joint order are probably wrong. The texts are also in ``problems``.
     """
-    compile_loops()
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    run = OfflineRun(source, sections(settings, delay))
+    checked = sections(settings, delay)
+    compile_loops()
+    run = OfflineRun(source, checked)
     arrays = run.arrays()
     problems = run.diagnosis.texts or ([] if run.poses else [NOBODY])
     warn(problems)

@@ -69,8 +69,8 @@ class Filter:
             hint = skeleton_hint(self._skeleton, ())
             raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
         self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
-        compile_loops()
         given = sections(settings, delay)
+        compile_loops()
         prior = given["prior"]
         self._prior, self._trajectory = make_prior(prior), make_trajectory(given["trajectory"])
         one_thread()

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
@@ -70,7 +71,7 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
     """Open a recorded source: rosbag2 directory, ``.mcap``, ``.npz``, ``.csv``, motion capture file, or video.
 
     Args:
-        path: path of the recording.
+        path: path of the recording, or the name of a bundled stream.
         rig: description of a motion capture file, for what the file itself lacks (`prior.mocap.files.Description`).
         image_file: file for the newest image of a video, for the viewer.
 
@@ -83,9 +84,11 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
         raise LaunchError(
             f"[input] recording: expected a recording, {_FILES} or a video to play, got none; give --input"
         )
-    path = Path(path)
+    path = located(str(path), Path(), STREAMS)
     if not path.exists():
-        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video")
+        own = PACKAGE / STREAMS / path.name
+        hint = f"; the bundled stream is {path.name!r}, without a folder" if own.is_dir() else ""
+        raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video{hint}")
     if path.suffix.lower() in VIDEOS:
         return _open_video(path, image_file)
     if holds_motion(path):

@@ -12,7 +12,7 @@ from steadypose.msgs.security import Keys
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.settings import LaunchError, load_plugin, path_setting
+from steadypose.nodes.settings import STREAMS, LaunchError, load_plugin, path_setting
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource, open_oak, open_webcam
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source, TfSettings, TfSource
 from steadypose.nodes.sources.source import (
@@ -70,8 +70,8 @@ class InputSettings:
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 
-    recording: str = path_setting(_declare(_open_recording))
-    """rosbag2 directory, .mcap, .npz or .csv to play; relative to the launch file"""
+    recording: str = path_setting(_declare(_open_recording), STREAMS)
+    """rosbag2 directory, .mcap, .npz or .csv to play, relative to the launch file; or the name of a bundled stream"""
     oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(open_oak, extra="oak"))
     webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
     ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source))

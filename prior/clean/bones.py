@@ -14,7 +14,6 @@ bones as well gained 0.2 % of a Kinect's error and cost 0.6 mm on a noise-free i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from steadypose.prior.body.bone_lengths import estimate_bones
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
 from steadypose.prior.clean.frame import Person
+from steadypose.prior.clean.settings import PersonSettings
 from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -59,21 +59,6 @@ _GROWTH = 1.5  # growth of the number of samples after which the estimate is ren
 _SLOTS_PER_RENEWAL = 8  # number of slots for each renewal allowed in one frame
 _APPROACH = 0.1  # share of the way to a renewed estimate per frame; a jump of the bones would shake the whole limb
 _MIN_SAMPLES = 4  # least number of samples for the bones to count as measured
-
-
-@dataclass(frozen=True)
-class PersonSettings:
-    """Settings of the bones stage.
-
-    Attributes:
-        enabled: whether to measure bones; if off, every body has a generic adult's bones.
-        samples: frames sampled before the estimate is frozen.
-        every: frames between two samples, so that their errors are less correlated.
-    """
-
-    enabled: bool = True
-    samples: int = 64
-    every: int = 5
 
 
 class PersonEstimator:

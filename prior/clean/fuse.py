@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,28 +16,9 @@ from steadypose.prior.clean.bones import SensorBias
 from steadypose.prior.clean.frame import Estimate, Imputed, Person
 from steadypose.prior.clean.history import BRIEF_S
 from steadypose.prior.clean.occluded import OccludedJoints, Track
+from steadypose.prior.clean.settings import FuseSettings
 from steadypose.prior.compiled import njit
 from steadypose.prior.timing.kalman import Smoothed
-
-
-@dataclass(frozen=True)
-class FuseSettings:
-    """Settings of the fuse stage. Standard deviations are along one axis.
-
-    Attributes:
-        enabled: whether to fuse; if off, the body has the decoded rotations, translated to fit the observed joints.
-        prior_sigma: metres, standard deviation of a joint placed by the decoded rotations in a well observed body.
-        prior_drift: m/s, growth of this deviation for an unobserved joint.
-        fade: seconds after which a joint that is neither observed nor completed within `MAX_SIGMA` is unknown.
-        weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
-    """
-
-    enabled: bool = True
-    prior_sigma: float = 0.1
-    prior_drift: float = 0.25
-    fade: float = 3.0
-    weights: str = "default"
-
 
 MAX_SIGMA = 0.25
 """Largest standard deviation along an axis at which a completed joint counts as known, metres. How long it has been

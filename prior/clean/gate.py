@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,28 +13,10 @@ from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.clean.frame import Gated, Observation
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.clean.outliers import RECENT, BoneOutliers, frozen_joints
+from steadypose.prior.clean.settings import GateSettings
 from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
-
-
-@dataclass(frozen=True)
-class GateSettings:
-    """Thresholds of the gate.
-
-    Attributes:
-        enabled: whether to reject outliers; if off, all observed joints pass.
-        jump: metres that a joint may be from its prediction, in addition to three standard deviations of the
-            prediction.
-        patience: seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted.
-        min_confidence: joints of lower confidence count as unobserved.
-    """
-
-    enabled: bool = True
-    jump: float = 0.18
-    patience: float = 0.3
-    min_confidence: float = 0.1
-
 
 # limbs whose sides detectors exchange: whole arms and whole legs
 _EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))

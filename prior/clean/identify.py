@@ -9,42 +9,15 @@ Tracking", IEEE AES Magazine 19(1), 2004, section II.C). Pairs with a score belo
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats, medians
 from steadypose.prior.body.skeleton import TRUNK_LANDMARKS, J, finite_joints
+from steadypose.prior.clean.settings import RECENT_S, IdentifySettings
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
-
-@dataclass(frozen=True)
-class IdentifySettings:
-    """Settings of the identify stage.
-
-    Attributes:
-        enabled: whether to assign ids here and ignore the source's; if off, the source's ids are passed on.
-        birth: seconds for which an unknown body must be observed before it gets an id.
-        death: seconds without an observation after which a person is forgotten. On return, the person gets a new id.
-    """
-
-    enabled: bool = False
-    birth: float = 0.25
-    death: float = 5.0
-
-    def __post_init__(self) -> None:
-        # a shorter `death` would drop tracks that can still be matched by position
-        for name, least in (("birth", 0.0), ("death", RECENT_S)):
-            if not least <= getattr(self, name) < 60.0:
-                raise ValueError(
-                    f"[prior.identify] {name}: expected {least:g} to 60 seconds, got {getattr(self, name)}"
-                )
-
-
-RECENT_S = 0.25
-"""Longest time without an observation after which a body is matched by position alone, seconds. Later, bone lengths
-must match as well."""
 ACCELERATION = 1.0
 """Spectral density of a visible body's white acceleration noise, m²/s³."""
 SPEED, SPEED_MEMORY_S = 0.6, 1.0

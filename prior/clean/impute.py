@@ -8,7 +8,6 @@ ones. Ascent in the latents does not gain either (benchmarks/NOTEBOOK.md).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,17 +26,6 @@ mean keeps one frame's noise out of the gap. With less jitter, the residual of t
 
 SIGMA_SCALE = 1.2
 """Error-to-sigma ratio of HG-VAE for limbs hidden for 0.3 to 2 s in validation motion."""
-
-
-@dataclass(frozen=True)
-class ImputeSettings:
-    """Settings of the impute stage.
-
-    Attributes:
-        enabled: whether to impute; if off, hidden joints keep their last local rotations.
-    """
-
-    enabled: bool = True
 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:

@@ -10,7 +10,6 @@ estimates share most of their noise, so the fusion weights account for correlate
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import HIPS, J
 from steadypose.prior.clean.frame import BodyWindows, Person
 from steadypose.prior.clean.history import BRIEF_S, History
+from steadypose.prior.clean.settings import ReconstructSettings
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
@@ -53,17 +53,6 @@ without the mean this would be jitter."""
 _BESIDE_PELVIS = np.array([*HIPS, J["spine1"]])
 
 
-@dataclass(frozen=True)
-class ReconstructSettings:
-    """Settings of the reconstruct stage (``[prior.reconstruct]``).
-
-    Attributes:
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
-
-    weights: str = "default"
-
-
 class Reconstruct:
     """Runs HG-VAE once per frame over the last frames of the bodies present."""
 
@@ -88,17 +77,6 @@ class Reconstruct:
         by_joint = np.clip(history.confidence[-self.frames :, slots], MIN_CONFIDENCE, 1.0)
         confidence = tracks.observed * np.repeat(by_joint.transpose(1, 2, 0), 3, axis=1)
         return BodyWindows(slots, tracks, size, self._model.reconstruct(tracks.x, confidence, bias_sigma[slots]))
-
-
-@dataclass(frozen=True)
-class DenoiseSettings:
-    """Settings of the denoise stage.
-
-    Attributes:
-        enabled: whether to denoise; if off, observed joints stay as smoothed.
-    """
-
-    enabled: bool = True
 
 
 class Denoise:

@@ -12,7 +12,7 @@ whole body's posture. Filters hold the twist of straight limbs and the usual dir
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +24,10 @@ from steadypose.prior.body.rotation_filters import follow_short_bones, follow_tw
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
+from steadypose.prior.clean.settings import OrientSettings, RefineSettings
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae import LiveHMVAE
 from steadypose.prior.models.posture import LivePosture, average_root
-
-
-@dataclass(frozen=True)
-class RefineSettings:
-    """Settings of the refine stage.
-
-    Attributes:
-        enabled: whether to refine. If off (the default), the solved rotations pass unchanged and no model is loaded.
-            With `impute` and `fuse` on, observed joints stay as smoothed and hidden joints as completed. Refinement
-            then changes no result by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
-
-    enabled: bool = False
-    weights: str = "default"
 
 
 class Refine:
@@ -89,19 +75,6 @@ class Refine:
         rotations = np.full_like(self._solved.newest, np.nan)
         rotations[slots] = solve_rotations(positions[slots], offsets[slots], fallback)
         self._solved.push(rotations)
-
-
-@dataclass(frozen=True)
-class OrientSettings:
-    """Settings of the orient stage.
-
-    Attributes:
-        enabled: whether to orient; if off, rotations are solved frame by frame from the published joints.
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
-
-    enabled: bool = True
-    weights: str = "default"
 
 
 class Orient:

@@ -12,13 +12,12 @@ The paper scores by log p(z | x) alone; `steadypose evaluate hgvae` compares the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.clean.frame import BodyWindows, Score
+from steadypose.prior.clean.settings import ScoreSettings
 from steadypose.prior.models.hgvae.faults import SENSOR_SIGMAS, Calibration, LiveFaultNet, decimals, joint_odds, pace
 from steadypose.prior.timing.rate import FPS
 
@@ -37,21 +36,6 @@ OWN_FRAMES, FIRST_FRAMES = 300, 30
 
 RELEASED = 0.8
 """Fraction of the flag's threshold below which the anomaly must stay for the flag to be cleared."""
-
-
-@dataclass(frozen=True)
-class ScoreSettings:
-    """Settings of the score stage.
-
-    Attributes:
-        enabled: whether to score; if off, the anomaly is NaN and the flag is not set.
-        false_alarms: share of frames of clean motion that may be flagged; 0.01 is one frame every three seconds.
-        hold: seconds for which the anomaly must stay below `RELEASED` times the threshold before the flag is cleared.
-    """
-
-    enabled: bool = True
-    false_alarms: float = 0.001
-    hold: float = 0.3
 
 
 class OwnScale:

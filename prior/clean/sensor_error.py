@@ -13,7 +13,7 @@ eigenvalue gives the missing variance. The position of the camera need not be kn
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.clean.frame import Gated
 from steadypose.prior.clean.history import Ring
+from steadypose.prior.clean.settings import CorrectSettings
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveCorrection, features, recall, trunk_frame
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
@@ -47,18 +48,6 @@ _ENTRIES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 """Index of each entry of a symmetric 3 × 3 matrix in the vector of its six distinct entries."""
 _ISOTROPIC = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 _TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-
-
-@dataclass(frozen=True)
-class CorrectSettings:
-    """Settings of the correct stage.
-
-    Attributes:
-        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. The error belongs to the sensor, not to
-            its joint layout: another camera with the same joints has other errors.
-    """
-
-    sensor: str = ""
 
 
 class Correct:

@@ -2,29 +2,71 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
-from steadypose.prior.clean.bones import PersonSettings
-from steadypose.prior.clean.fuse import FuseSettings
-from steadypose.prior.clean.gate import GateSettings
-from steadypose.prior.clean.identify import IdentifySettings
-from steadypose.prior.clean.impute import ImputeSettings
-from steadypose.prior.clean.reconstruct import DenoiseSettings, ReconstructSettings
-from steadypose.prior.clean.rotations import OrientSettings, RefineSettings
-from steadypose.prior.clean.score import ScoreSettings
-from steadypose.prior.clean.sensor_error import CorrectSettings
-from steadypose.prior.settings import build_settings, check_range, current_keys
-
-logger = logging.getLogger(__name__)
+from steadypose.prior.settings import build_settings, check_range, current_keys, weights_setting
 
 MAX_DELAY = 16
 """Longest delay that the mixture of smoothers is trained for, frames."""
 
-UNUSED = ("steps", "rate")
-"""Keys of ``[prior.impute]`` in version 0.2, ignored with a warning. Gradient ascent in the latents gained nothing."""
+RECENT_S = 0.25
+"""Longest time without an observation after which `identify` matches a body by position alone, seconds. Later, bone
+lengths must match as well."""
+
+
+@dataclass(frozen=True)
+class IdentifySettings:
+    """Settings of the identify stage.
+
+    Attributes:
+        enabled: whether to assign ids here and ignore the source's; if off, the source's ids are passed on.
+        birth: seconds for which an unknown body must be observed before it gets an id.
+        death: seconds without an observation after which a person is forgotten. On return, the person gets a new id.
+    """
+
+    enabled: bool = False
+    birth: float = 0.25
+    death: float = 5.0
+
+    def __post_init__(self) -> None:
+        # a shorter `death` would drop tracks that can still be matched by position
+        for name, least in (("birth", 0.0), ("death", RECENT_S)):
+            if not least <= getattr(self, name) < 60.0:
+                raise ValueError(
+                    f"[prior.identify] {name}: expected {least:g} to 60 seconds, got {getattr(self, name)}"
+                )
+
+
+@dataclass(frozen=True)
+class GateSettings:
+    """Thresholds of the gate.
+
+    Attributes:
+        enabled: whether to reject outliers; if off, all observed joints pass.
+        jump: metres that a joint may be from its prediction, in addition to three standard deviations of the
+            prediction.
+        patience: seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted.
+        min_confidence: joints of lower confidence count as unobserved.
+    """
+
+    enabled: bool = True
+    jump: float = 0.18
+    patience: float = 0.3
+    min_confidence: float = 0.1
+
+
+@dataclass(frozen=True)
+class CorrectSettings:
+    """Settings of the correct stage.
+
+    Attributes:
+        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. The error belongs to the sensor, not to
+            its joint layout: another camera with the same joints has other errors.
+    """
+
+    sensor: str = weights_setting("correction", default="")
 
 
 @dataclass(frozen=True)
@@ -35,7 +77,117 @@ class SmoothSettings:
         weights: weight set (``default``), or a path to a ``.safetensors`` file.
     """
 
-    weights: str = "default"
+    weights: str = weights_setting("mixture")
+
+
+@dataclass(frozen=True)
+class ReconstructSettings:
+    """Settings of the reconstruct stage (``[prior.reconstruct]``).
+
+    Attributes:
+        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
+    """
+
+    weights: str = weights_setting("hgvae")
+
+
+@dataclass(frozen=True)
+class DenoiseSettings:
+    """Settings of the denoise stage.
+
+    Attributes:
+        enabled: whether to denoise; if off, observed joints stay as smoothed.
+    """
+
+    enabled: bool = True
+
+
+@dataclass(frozen=True)
+class PersonSettings:
+    """Settings of the bones stage.
+
+    Attributes:
+        enabled: whether to measure bones; if off, every body has a generic adult's bones.
+        samples: frames sampled before the estimate is frozen.
+        every: frames between two samples, so that their errors are less correlated.
+    """
+
+    enabled: bool = True
+    samples: int = 64
+    every: int = 5
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """Settings of the score stage.
+
+    Attributes:
+        enabled: whether to score; if off, the anomaly is NaN and the flag is not set.
+        false_alarms: share of frames of clean motion that may be flagged; 0.01 is one frame every three seconds.
+        hold: seconds for which the anomaly must stay below `score.RELEASED` times the threshold for the flag to clear.
+    """
+
+    enabled: bool = True
+    false_alarms: float = 0.001
+    hold: float = 0.3
+
+
+@dataclass(frozen=True)
+class ImputeSettings:
+    """Settings of the impute stage.
+
+    Attributes:
+        enabled: whether to impute; if off, hidden joints keep their last local rotations.
+    """
+
+    enabled: bool = True
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Settings of the refine stage.
+
+    Attributes:
+        enabled: whether to refine. If off (the default), the solved rotations pass unchanged and no model is loaded.
+            With `impute` and `fuse` on, observed joints stay as smoothed and hidden joints as completed. Refinement
+            then changes no result by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
+        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
+    """
+
+    enabled: bool = False
+    weights: str = weights_setting("hmvae")
+
+
+@dataclass(frozen=True)
+class FuseSettings:
+    """Settings of the fuse stage. Standard deviations are along one axis.
+
+    Attributes:
+        enabled: whether to fuse; if off, the body has the decoded rotations, translated to fit the observed joints.
+        prior_sigma: metres, standard deviation of a joint placed by the decoded rotations in a well observed body.
+        prior_drift: m/s, growth of this deviation for an unobserved joint.
+        fade: seconds after which a joint that is neither observed nor completed within `fuse.MAX_SIGMA` is unknown.
+        weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
+    """
+
+    enabled: bool = True
+    prior_sigma: float = 0.1
+    prior_drift: float = 0.25
+    fade: float = 3.0
+    weights: str = weights_setting("occlusion")
+
+
+@dataclass(frozen=True)
+class OrientSettings:
+    """Settings of the orient stage.
+
+    Attributes:
+        enabled: whether to orient; if off, rotations are solved frame by frame from the published joints.
+        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
+    """
+
+    enabled: bool = True
+    weights: str = weights_setting("posture")
 
 
 @dataclass(frozen=True)
@@ -91,9 +243,4 @@ class PriorSettings:
         Raises:
             ValueError: for an unknown key (the message names the most similar one) or a wrong type.
         """
-        settings = current_keys("prior", settings)
-        impute = settings.get("impute")
-        if isinstance(impute, Mapping) and (unused := [key for key in UNUSED if key in impute]):
-            logger.warning("[prior.impute] %s: no longer used, and to be refused by a later version", ", ".join(unused))
-            settings = {**settings, "impute": {key: value for key, value in impute.items() if key not in unused}}
-        return build_settings(cls, settings, "prior")
+        return build_settings(cls, current_keys("prior", settings), "prior")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from steadypose import PACKAGE
+from steadypose.prior.settings import MODEL
 
 Arrays: TypeAlias = Mapping[str, NDArray[np.float32]]
 """A network's weights by their names in its state dict, such as ``blocks.0.first.weight``."""
@@ -50,8 +52,33 @@ class WeightsError(ValueError):
 
 
 def weights_path(name: str, model: str) -> Path:
-    """Return the path of a model's weights, given a weight set's name or a path."""
-    return Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
+    """Return the path of a model's weights, given a weight set's name or a path.
+
+    Raises:
+        FileNotFoundError: there are no such weights; the message lists those that exist.
+    """
+    path = Path(name) if name.endswith(".safetensors") else WEIGHTS / f"{model}-{name}.safetensors"
+    if path.is_file():
+        return path
+    known = sorted(p.stem.removeprefix(f"{model}-") for p in WEIGHTS.glob(f"{model}-*.safetensors"))
+    raise FileNotFoundError(
+        f"no weights '{name}' for {model}: expected {path.name}; there are {', '.join(known) or 'none'}. "
+        f"Name one of these, or make them with 'steadypose train {model}'."
+    )
+
+
+def check_weights(settings: Any) -> None:
+    """Check that the weights that a dataclass of settings names exist, except those of switched-off stages.
+
+    Raises:
+        FileNotFoundError: as `weights_path`.
+    """
+    for setting in fields(settings):
+        value, model = getattr(settings, setting.name), setting.metadata.get(MODEL)
+        if is_dataclass(value):
+            check_weights(value)
+        elif model and value and getattr(settings, "enabled", True):
+            weights_path(value, model)
 
 
 def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
@@ -66,12 +93,6 @@ def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
         WeightsError: the file is damaged, was not written by `steadypose train`, or holds another model.
     """
     path = weights_path(name, model)
-    if not path.is_file():
-        known = sorted(p.stem.removeprefix(f"{model}-") for p in WEIGHTS.glob(f"{model}-*.safetensors"))
-        raise FileNotFoundError(
-            f"no weights '{name}' for {model}: expected {path.name}; there are {', '.join(known) or 'none'}. "
-            f"Name one of these, or make them with 'steadypose train {model}'."
-        )
     try:
         with safe_open(path, framework="numpy") as file:
             config = (file.metadata() or {}).get("config")

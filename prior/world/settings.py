@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from steadypose.prior.settings import build_settings
+from steadypose.prior.settings import build_settings, weights_setting
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class TrajectorySettings:
         timeout_s: seconds without a message that contains it after which a body is forgotten.
     """
 
-    weights: str = "default"
-    contact_weights: str = "default"
+    weights: str = weights_setting("trajectory")
+    contact_weights: str = weights_setting("contacts")
     network: bool = True
     contacts: bool = True
     acceleration: float = 3.0

@@ -22,9 +22,11 @@ from steadypose.msgs.codec import encode
 from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import stream
-from steadypose.nodes.graph.prior_node import make_batch, make_prior
+from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.clean.batch import StreamBatch
+from steadypose.prior.clean.settings import PriorSettings
 
 STREAMS = sorted(path.parent for path in (Path(__file__).parents[2] / "sim_data").glob("*/metadata.yaml"))
 OFF = ("gate", "denoise", "person", "score", "impute", "fuse")
@@ -69,7 +71,7 @@ def outcomes() -> Iterator[tuple[str, str]]:
 
 
 def _batch() -> Iterator[Message]:
-    batch = make_batch({}, 2)
+    batch = StreamBatch(PriorSettings(), 2)
     kept = [[m for _, m in islice(open_recording(path), FRAMES) if isinstance(m, PoseRaw)] for path in STREAMS[:2]]
     for k, (first, second) in enumerate(zip(*kept, strict=False)):
         for source, message in (("a", first), ("b", second)):

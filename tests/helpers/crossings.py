@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.prior.body.layouts import get_skeleton, to_canonical
-from steadypose.prior.clean.identify import Identify, IdentifySettings
+from steadypose.prior.clean.identify import Identify
+from steadypose.prior.clean.settings import IdentifySettings
 from steadypose.prior.sim.streams import Stream, make
 
 MANIFEST = Path(__file__).parents[2] / "sim_data" / "manifest.json"

@@ -15,6 +15,7 @@ import pytest
 from conftest import until
 
 from steadypose.nodes.graph.launch import Launch, tomllib
+from steadypose.prior.clean.settings import PriorSettings
 
 PACKAGE = Path(__file__).parents[2] / "ros2/steadypose_ros"
 PROGRAM = Path(sys.executable).parent / "steadypose"
@@ -141,7 +142,7 @@ def test_parameters_become_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     said = {name: tomllib.loads(f"v = {value}")["v"] for name, _, value in (it.partition("=") for it in command[4::2])}
     assert said == given | {"ros2.namespace": "fleet/robot"}
     settings = [it for it in command[4::2] if it.startswith(("ros2.", "prior."))]
-    assert Launch.read("ros2", settings).table("prior")["delay"] == 2
+    assert Launch.read("ros2", settings).settings(PriorSettings).delay == 2
     assert arguments(OWN | {"ros2.namespace": "other"}, "/robot")[4:] == ['ros2.namespace="other"']
 
 

@@ -82,7 +82,7 @@ class ViewerNode(Node):
 
 def flagged_from(launch: Launch) -> float:
     """The anomaly score above which the prior raises its flag."""
-    return -math.log10(PriorSettings.from_dict(launch.table("prior")).score.false_alarms)
+    return -math.log10(launch.settings(PriorSettings).score.false_alarms)
 
 
 def connect(server: ViewerServer) -> rr.RecordingStream:

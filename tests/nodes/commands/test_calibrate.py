@@ -20,6 +20,7 @@ from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import Intrinsics, find_corners
+from steadypose.prior.clean.settings import PriorSettings
 
 LENS = Intrinsics((640, 360), (520.0, 518.0), (322.0, 177.0), (0.03, -0.05, 0.0, 0.0, 0.0))
 EYE = look_at(np.array([-0.1, -0.7, 0.8]), np.array([0.2, 0.1, 0.0]))
@@ -57,7 +58,7 @@ def test_board_lens_and_pose_end_in_the_launch_file(
     text = launch.read_text()
     assert "# our kitchen" in text
     assert '"oak" # by the window' in text
-    assert Launch.read(launch).table("prior") == {"delay": 2}
+    assert Launch.read(launch).settings(PriorSettings).delay == 2
     drawn = cv2.imread(str(tmp_path / "kitchen.floor.png"))
     assert drawn is not None
     assert drawn.shape == (360, 640, 3)

@@ -59,7 +59,7 @@ def test_every_command_is_where_it_is_said_to_be() -> None:
         (["xyzzy"], "there are run, node"),
         (["run", "nolaunch"], "no launch file 'nolaunch'"),
         (["run", "--input", "nowhere"], "does not exist"),
-        (["run", "--set", "input.rat=3"], "did you mean 'rate'"),
+        (["run", "--set", "input.rat=3"], "did you mean 'input.rate'"),
         (["node", "priro"], "did you mean 'prior'"),
     ],
 )

@@ -6,12 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.nodes.graph.launch import Launch, bundled, find, full_key, pipeline_sections
+from steadypose.nodes.graph.launch import (
+    Launch,
+    bundled,
+    check_weights_of,
+    find,
+    full_key,
+    in_launch_file,
+    pipeline_sections,
+)
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
-from steadypose.nodes.sources.registry import InputSettings
-from steadypose.prior.clean.bones import PersonSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.nodes.sources.registry import InputSettings, check_input
+from steadypose.prior.clean.settings import PersonSettings, PriorSettings
 from steadypose.prior.settings import _warn_of_former_name
 
 
@@ -61,6 +68,10 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[server]\nclients = [7111]", "clients: expected addresses such as tcp://.*, got 7111"),
         ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
         ("[input", "is not TOML"),
+        ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya': did you mean 'delay'"),
+        ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup': did you mean 'jump'"),
+        ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
+        ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok': did you mean 'network'"),
     ],
 )
 def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expected: str) -> None:
@@ -80,8 +91,42 @@ def test_paths_start_at_the_file_and_overrides_win(write, tmp_path: Path) -> Non
     launch = Launch.read(path, ["input.rate=0", "prior.refine.enabled=false", "recorder.directory=/somewhere/out"])
     assert launch.settings(InputSettings).recording == str(tmp_path / "walk")
     assert launch.settings(InputSettings).rate == 0.0
-    assert launch.table("prior") == {"refine": {"enabled": False}}
+    assert not launch.settings(PriorSettings).refine.enabled
     assert launch.settings(RecorderSettings).directory == "/somewhere/out"
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in bundled("launch").glob("*.toml")))
+def test_a_copied_launch_file_means_the_same(name: str, tmp_path: Path) -> None:
+    copied = tmp_path / "mine.toml"
+    copied.write_bytes(find(name).read_bytes())
+    assert Launch.read(copied) == Launch.read(name)
+
+
+def test_the_users_own_file_comes_before_a_bundled_stream(write, tmp_path: Path) -> None:
+    launch = write("[input]\nrecording = 'walk_turn'")
+    assert Launch.read(launch).settings(InputSettings).recording == str(bundled("sim_data", "walk_turn"))
+    (tmp_path / "walk_turn").mkdir()
+    assert Launch.read(launch).settings(InputSettings).recording == str(tmp_path / "walk_turn")
+    with pytest.raises(LaunchError, match=r"the bundled stream is 'walk_turn', without a folder"):
+        check_input(Launch.read(write("[input]\nrecording = 'sim_data/walk_turn'")))
+
+
+def test_weights_are_looked_for_before_anything_starts(write, tmp_path: Path) -> None:
+    check_weights_of(Launch.read(write("[prior.refine]\nweights = 'mine.safetensors'")))  # a stage that is off
+    launch = Launch.read(write("[prior.smooth]\nweights = 'mine.safetensors'"))
+    assert launch.settings(PriorSettings).smooth.weights == str(tmp_path / "mine.safetensors")
+    with pytest.raises(LaunchError, match=r"no weights '.*mine.safetensors' for mixture"):
+        check_weights_of(launch)
+    with pytest.raises(LaunchError, match=r"no weights 'defualt' for contacts: .* there are default"):
+        check_weights_of(Launch.read(write("[trajectory]\ncontact_weights = 'defualt'")))
+
+
+def test_an_abbreviated_setting_is_completed_and_a_wrong_one_refused() -> None:
+    as_they_are = ["nodes=['prior']", "prior.gate={}", "input.options.port=7", "transport.queue=4"]
+    assert in_launch_file("replay", ["delay=2", *as_they_are]) == ["prior.delay=2", *as_they_are]
+    for wrong, near in {"prior.delya": "prior.delay", "priro.delay": "prior.delay", "input.rat": "input.rate"}.items():
+        with pytest.raises(LaunchError, match=f"--set {wrong}: no such setting, did you mean '{near}'"):
+            in_launch_file("replay", [f"{wrong}=2"])
 
 
 @pytest.mark.parametrize("override", ["input.rate", "=3", "input.rate.x=3"])
@@ -122,7 +167,7 @@ def test_former_names_mean_the_new_ones(
 ) -> None:
     _warn_of_former_name.cache_clear()
     launch = Launch.read(write(text), [full_key(override, pipeline_sections())])
-    assert PriorSettings.from_dict(launch.table("prior")).person == PersonSettings(samples=40, every=4)
+    assert launch.settings(PriorSettings).person == PersonSettings(samples=40, every=4)
     warned = [record.getMessage().split()[1] for record in caplog.records]
     assert sorted(warned) == former, "once each"
 

@@ -13,7 +13,7 @@ import pytest
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.nodes.graph import topology
 from steadypose.nodes.graph.clock import SystemClock
-from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.topology import NODES, NodeDeclaration
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.registry import InputSettings, check_input, open_input
@@ -46,6 +46,7 @@ def test_a_node_of_another_package_is_one_of_the_graph(package: Any, tmp_path: P
     assert launch.reliable_subscribers("trajectory") == {"robot"}
     assert read(tmp_path / "a.toml", text) == launch
     assert list(NODES)[-1] == "robot"
+    assert in_launch_file(tmp_path / "a.toml", ["robot.speed=3"]) == ["robot.speed=3"]
 
 
 def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Path) -> None:

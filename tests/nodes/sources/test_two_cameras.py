@@ -22,6 +22,7 @@ from steadypose.nodes.sources.camera import MergeSettings, MergeSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.nodes.sources.source import CalibrationSettings, SourceContext
+from steadypose.prior.clean.settings import PriorSettings
 
 FRAMES = 30
 PLACES = {
@@ -133,4 +134,4 @@ def test_the_launch_file_that_ships_reads() -> None:
     launch = Launch.read("two_cameras")
     assert len(launch.settings(InputSettings).merge.cameras) == 2
     assert not launch.transport.lossless
-    assert launch.table("prior") == {"identify": {"enabled": True}}
+    assert launch.settings(PriorSettings).identify.enabled

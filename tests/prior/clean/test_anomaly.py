@@ -8,8 +8,8 @@ from tests.helpers.bodies import stream, waving
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.score import OwnScale, Scorer, ScoreSettings
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.score import OwnScale, Scorer
+from steadypose.prior.clean.settings import PriorSettings, ScoreSettings
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.faults import (
     FROZEN_ODDS,

@@ -6,15 +6,9 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import RIGID, place_joints
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.clean.bones import (
-    MIN_FRAMES,
-    UNKNOWN_VARIANCE,
-    BiasEstimator,
-    PersonEstimator,
-    PersonSettings,
-    SensorBias,
-)
+from steadypose.prior.clean.bones import MIN_FRAMES, UNKNOWN_VARIANCE, BiasEstimator, PersonEstimator, SensorBias
 from steadypose.prior.clean.frame import Person
+from steadypose.prior.clean.settings import PersonSettings
 from steadypose.prior.timing.kalman import Smoothed
 
 BONES = np.tile(REST_OFFSETS, (1, 1, 1))

@@ -7,7 +7,8 @@ from tests.helpers.bodies import waving
 from tests.helpers.values import observation
 
 from steadypose.prior.body.skeleton import MIRROR, J
-from steadypose.prior.clean.gate import Gate, GateSettings
+from steadypose.prior.clean.gate import Gate
+from steadypose.prior.clean.settings import GateSettings
 
 WRIST, KNEE = J["left_wrist"], J["right_knee"]
 ARM = [J[f"left_{name}"] for name in ("shoulder", "elbow", "wrist")]

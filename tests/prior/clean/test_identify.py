@@ -8,9 +8,9 @@ from tests.helpers.bodies import PERIOD_NS, raw, waving
 from tests.helpers.crossings import MANIFEST, all_hidden, score, watch
 
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.identify import Identify, IdentifySettings, _bone_lengths, _place_score, _unobserved
+from steadypose.prior.clean.identify import Identify, _bone_lengths, _place_score, _unobserved
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import IdentifySettings, PriorSettings
 from steadypose.prior.sim.streams import read_manifest
 
 START_NS = 1_700_000_000_000_000_000

@@ -4,9 +4,9 @@ from tests.helpers.bodies import stream, waving
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.impute import CARRY_FRAMES, ImputeSettings, _carried
+from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 
 ARM = [J["left_elbow"], J["left_wrist"]]
 

@@ -6,7 +6,8 @@ from tests.helpers.values import gated
 
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import MIRROR, J
-from steadypose.prior.clean.sensor_error import Correct, CorrectSettings
+from steadypose.prior.clean.sensor_error import Correct
+from steadypose.prior.clean.settings import CorrectSettings
 from steadypose.prior.models.sensor_bias import (
     FEATURES,
     HISTORY,
