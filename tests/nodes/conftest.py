@@ -57,12 +57,6 @@ def folder() -> Iterator[Path]:
     shutil.rmtree(path)
 
 
-@pytest.fixture(scope="session")
-def weights() -> dict[str, str]:
-    """The weights that ship, as overrides of a launch file."""
-    return {"prior.refine.weights": "default", "trajectory.weights": "default"}
-
-
 @pytest.fixture
 def make_launch(folder: Path, tmp_path: Path) -> Callable[..., Launch]:
     """A launch with its sockets in ``folder``; settings by their path, dots as ``__``."""
@@ -100,6 +94,18 @@ def walking(index: int, body: int = 0) -> RawBody:
 
 def walk(frames: int, bodies: int = 1) -> list[PoseRaw]:
     return [raw(i, *(walking(i, body) for body in range(bodies))) for i in range(frames)]
+
+
+def walked(frames: int) -> np.ndarray:
+    """(T, 22, 3) metres, z up: the joints of `walk`."""
+    return np.array([frame.bodies[0].positions for frame in walk(frames)])
+
+
+def write_npz(path: Path, positions: np.ndarray, **more: object) -> Path:
+    """Write an input of `clean`, at 30 Hz unless ``more`` has stamps or another rate."""
+    arrays = {"positions": positions, "skeleton": "smpl22"} | ({} if "stamp_ns" in more else {"fps": 30.0}) | more
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    return path
 
 
 def record(directory: Path, messages: list[PoseRaw]) -> Path:

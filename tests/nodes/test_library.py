@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.nodes.conftest import walk
+from tests.nodes.conftest import walked, write_npz
 
 import steadypose
 from steadypose.nodes.cli import main
@@ -16,17 +16,13 @@ from steadypose.nodes.commands.output import clean_recording
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)
 FRAMES = 45
-
-
-def walked() -> np.ndarray:
-    """(T, 22, 3) metres, z up."""
-    return np.array([frame.bodies[0].positions for frame in walk(FRAMES)])
+WALK = walked(FRAMES)
 
 
 def test_it_gives_what_the_command_writes(tmp_path: Path) -> None:
-    joints = walked()
+    joints = WALK.copy()
     joints[20:30, 21] = np.nan
-    np.savez(tmp_path / "in.npz", positions=joints, skeleton="smpl22", fps=25.0)
+    write_npz(tmp_path / "in.npz", joints, fps=25.0)
     clean_recording(tmp_path / "in.npz", tmp_path / "out.npz", {"prior": {"delay": 2}, "trajectory": {}})
     given = steadypose.clean(joints, fps=25.0, delay=2)
     with np.load(tmp_path / "out.npz") as written:
@@ -37,7 +33,7 @@ def test_it_gives_what_the_command_writes(tmp_path: Path) -> None:
 
 def test_several_bodies() -> None:
     """As many as came, each as it is alone; one who is away for a while is not made up."""
-    joints = np.stack([walked(), walked() + [3.0, 0.0, 0.0]], axis=1)
+    joints = np.stack([WALK, WALK + [3.0, 0.0, 0.0]], axis=1)
     joints[:30, 1] = np.nan
     given = steadypose.clean(joints, fps=30.0)
     assert given["body_id"].tolist() == [0, 1]
@@ -58,7 +54,7 @@ def test_the_first_is_ten_lines() -> None:
 
 
 def test_it_is_a_dictionary_still_and_knows_its_arrays_by_name(tmp_path: Path) -> None:
-    poses = steadypose.clean(walked(), fps=30.0)
+    poses = steadypose.clean(WALK, fps=30.0)
     assert isinstance(poses, dict)
     assert poses.to_dict() == dict(poses)
     assert type(poses.to_dict()) is dict
@@ -73,7 +69,7 @@ def test_it_is_a_dictionary_still_and_knows_its_arrays_by_name(tmp_path: Path) -
 
 
 def test_as_a_table_and_as_a_dataset() -> None:
-    poses = steadypose.clean(np.stack([walked(), walked() + [3.0, 0.0, 0.0]], axis=1), fps=30.0)
+    poses = steadypose.clean(np.stack([WALK, WALK + [3.0, 0.0, 0.0]], axis=1), fps=30.0)
     table = poses.to_pandas()
     assert len(table) == 2 * FRAMES
     second = table[table["body"] == 1]
@@ -83,7 +79,7 @@ def test_as_a_table_and_as_a_dataset() -> None:
     assert data["positions"].dims == ("time", "body", "joint", "axis")
     wrist = data["world_positions"].sel(joint="left_wrist", body=1)
     np.testing.assert_array_equal(wrist, poses.world["left_wrist"][:, 1])
-    moment = steadypose.Filter(delay=0)(walked()[0], 0.0)
+    moment = steadypose.Filter(delay=0)(WALK[0], 0.0)
     assert moment is not None
     assert len(moment.to_pandas()) == 1
     assert moment.to_xarray()["sigma"].dims == ("joint",)
@@ -101,22 +97,18 @@ def test_the_sample_has_its_truth() -> None:
 
 
 def test_key_frames_are_completed_and_drawn(tmp_path: Path) -> None:
-    joints = walked()
     keys = np.arange(0, FRAMES, 10)
-    stamps = np.round(keys * 1e9 / 30).astype(np.int64)
-    poses = steadypose.complete(joints[keys], stamp_ns=stamps)
-    assert poses["positions"].shape == (keys[-1] + 1, 22, 3)
-    np.testing.assert_allclose(poses["positions"][keys], joints[keys], atol=1e-6)
+    poses = steadypose.complete(WALK[keys], stamp_ns=np.round(keys * 1e9 / 30).astype(np.int64))
+    np.testing.assert_allclose(poses["positions"][keys], WALK[keys], atol=1e-6)
     assert (poses.state["head"][1:10] == steadypose.JointState.IMPUTED).all()
-    figure = steadypose.plot(poses, tmp_path / "picture.png")
-    assert figure.axes
+    assert steadypose.plot(poses, tmp_path / "picture.png").axes
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
 def test_a_fit_is_that_of_the_command(tmp_path: Path) -> None:
-    joints = walked()[:40]
-    np.savez(tmp_path / "in.npz", positions=joints, skeleton="smpl22", fps=30.0)
+    joints = WALK[:40]
+    write_npz(tmp_path / "in.npz", joints)
     assert main(["fit", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 0
     poses = steadypose.fit(joints, fps=30.0)
     with np.load(tmp_path / "out.npz") as written:

@@ -1,11 +1,10 @@
-"""What is published on /tf and our own buffer of transforms, against tf2's own: the C++ core in Debian's `python3-tf2`.
+"""Our own buffer of transforms, against tf2's own: the C++ core in Debian's `python3-tf2`.
 
 That is ROS 1's package, for the system's Python, from which ROS 2's `tf2::BufferCore` was ported.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import subprocess
 from collections.abc import Callable, Iterator
@@ -14,20 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import running, until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.helpers.synthetic_poses import messages
 
-from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import Pose, PoseClean, PoseWorld
-from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.ros2.definitions import deserialise, stamp_ns
-from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode
+from steadypose.nodes.ros2.definitions import stamp_ns
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
-from steadypose.nodes.sinks.ros2.rep155 import LINKS, body_name, frames
 from steadypose.nodes.sources.ros2 import TransformBuffer, TransformError
 
 pytestmark = pytest.mark.slow
@@ -160,93 +151,3 @@ def test_our_buffer_answers_as_tf2_does(tf2: Ask, asked: tuple[list[tuple[Any, b
             assert ours == theirs, lookup
         else:
             _assert_pose(ours, theirs[0], Rotation.from_quat(theirs[1]))
-
-
-@pytest.mark.usefixtures("ros")
-def test_tf2_finds_bodies_and_a_moving_sensor_from_what_is_published(
-    tf2: Ask, make_launch: Callable[..., Launch]
-) -> None:
-    """The bridge over DDS: each link by stamp, between stamps, and in the frame of a camera that moves."""
-    from steadypose.nodes.ros2.dds import DdsConnection
-
-    found = list(messages(0.7, bodies=2))
-    worlds = [message for topic, message in found if topic == POSE_WORLD and isinstance(message, PoseWorld)]
-    cleans = [
-        dataclasses.replace(
-            message,
-            frame_id="camera",
-            calibrated=True,
-            sensor_pose=Pose(np.array([0.1 * step, -4.0, 1.3]), Rotation.from_euler("z", 0.05 * step).as_quat()),
-        )
-        for step, message in enumerate(m for topic, m in found if topic == POSE_CLEAN)
-        if isinstance(message, PoseClean)
-    ]
-    launch = make_launch(
-        nodes='["prior", "trajectory", "ros2_bridge"]', transport__lossless="true", ros2__world_frame="odom"
-    )
-    told: list[tuple[Any, bool]] = []
-    connection = DdsConnection()
-
-    def hear(static: bool) -> Callable[[bytes], None]:
-        return lambda cdr: told.append((deserialise(cdr, "tf2_msgs/msg/TFMessage"), static))
-
-    connection.subscribe("tf", "tf2_msgs/msg/TFMessage", hear(False), depth=100)
-    connection.subscribe("tf_static", "tf2_msgs/msg/TFMessage", hear(True), latched=True)
-
-    def stamps(frame: str) -> set[int]:
-        connection.spin(0.001)
-        every = [(one, static) for message, static in told for one in message.transforms]
-        return {stamp_ns(one.header) for one, static in every if one.child_frame_id == frame and not static}
-
-    try:
-        with (
-            Publisher(launch.transport.endpoint("prior"), reliable={"ros2_bridge"}) as prior,
-            Publisher(launch.transport.endpoint("trajectory"), reliable={"ros2_bridge"}) as trajectory,
-            running(Ros2BridgeNode(launch)),
-        ):
-
-            def publish_until_heard(clean: PoseClean, world: PoseWorld) -> None:
-                def came() -> bool:
-                    prior.publish(POSE_CLEAN, clean, timeout_s=1)
-                    trajectory.publish(POSE_WORLD, world, timeout_s=1)
-                    return world.stamp_ns in stamps("body_b0")
-
-                until(came)
-
-            # the camera's first pose is static; the second makes it one that moves
-            for clean, world in zip(cleans, worlds, strict=True):
-                publish_until_heard(clean, world)
-            until(lambda: bool(stamps("camera")))
-    finally:
-        connection.close()
-
-    last = max(stamp for message, static in told if not static for stamp in [stamp_ns(message.transforms[0].header)])
-    assert last == worlds[-1].stamp_ns
-    links: list[tuple[Lookup, Any, Rotation]] = []
-    for world in worlds[2:-1]:
-        for body in world.bodies:
-            for link, (place, turned) in frames(body).items():
-                lookup = ("odom", f"{link}_{body_name(body.id)}", world.stamp_ns)
-                links.append((lookup, place, Rotation.from_matrix(turned)))
-    assert {link.rpartition("_")[0] for (_, link, _), _, _ in links} == set(LINKS)
-    for (_, place, turned), answer in zip(links, tf2(told, [lookup for lookup, _, _ in links]), strict=True):
-        _assert_pose(answer, place, turned)
-
-    a, b = worlds[5], worlds[6]
-    middle = (a.stamp_ns + b.stamp_ns) // 2
-    camera = ("odom", "camera", cleans[6].stamp_ns)
-    # ROS 1's core keeps a frame static that has been so once; that of ROS 2 does not, nor does ours
-    moving = [(message, static) for message, static in told if not static]
-    buffer = TransformBuffer()
-    for message, static in told:
-        buffer.add(message, static=static)
-    sensor = cleans[6].sensor_pose
-    _assert_pose(buffer.lookup(*camera), sensor.position, Rotation.from_quat(sensor.orientation))
-    head = frames(b.bodies[1])["head"][0]
-    between, seen, pose = tf2(moving, [("odom", "body_b1", middle), ("camera", "head_b1", b.stamp_ns), camera])
-    np.testing.assert_allclose(between[0], (a.bodies[1].root_position + b.bodies[1].root_position) / 2, atol=1e-6)
-    _assert_pose(pose, sensor.position, Rotation.from_quat(sensor.orientation))
-    np.testing.assert_allclose(
-        seen[0], Rotation.from_quat(sensor.orientation).inv().apply(head - sensor.position), atol=1e-6
-    )
-    assert tf2(told, [("odom", "head_b0", worlds[-1].stamp_ns + 1)]) == ["extrapolation"]

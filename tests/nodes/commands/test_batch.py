@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from conftest import record, walk
-from rich.console import Console
+from conftest import record, walk, walked, write_npz
 
 from steadypose.nodes.commands import batch
-from steadypose.nodes.commands.batch import Job, _Worker, find_recordings, is_folder_of_recordings, on_cores, plan, work
+from steadypose.nodes.commands.batch import Job, find_recordings, is_folder_of_recordings, on_cores, plan, work
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.settings import LaunchError
@@ -24,19 +21,8 @@ from steadypose.nodes.settings import LaunchError
 pytestmark = pytest.mark.slow
 
 FRAMES = 15
-
-
-@pytest.fixture
-def options(weights: dict[str, str]) -> tuple[str, ...]:
-    return tuple(f"{key.removeprefix('prior.')}={value}" for key, value in weights.items())
-
-
-@pytest.fixture
-def settings(weights: dict[str, str]) -> dict[str, Any]:
-    return {
-        "prior": {"refine": {"weights": weights["prior.refine.weights"]}},
-        "trajectory": {"weights": weights["trajectory.weights"]},
-    }
+WALK = walked(FRAMES)
+DEFAULT: dict[str, Any] = {"prior": {}, "trajectory": {}}
 
 
 @pytest.fixture
@@ -53,17 +39,11 @@ def here(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     return done
 
 
-def write_npz(path: Path, frames: int = FRAMES) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    positions = np.array([frame.bodies[0].positions for frame in walk(frames)])
-    np.savez(path, positions=positions, skeleton="smpl22", fps=30.0)
-    return path
-
-
 def a_folder(path: Path) -> Path:
     """A file, one deeper down, one that is broken, and a recording."""
-    write_npz(path / "a.npz")
-    write_npz(path / "day" / "b.npz")
+    (path / "day").mkdir(parents=True)
+    write_npz(path / "a.npz", WALK)
+    write_npz(path / "day" / "b.npz", WALK)
     (path / "broken.npz").write_bytes(b"no zip")
     record(path / "day" / "c", walk(FRAMES))
     return path
@@ -77,9 +57,13 @@ def names(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_processes_clean_a_folder(tmp_path: Path, options: tuple[str, ...], settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize("ray", [False, True])
+def test_processes_or_a_cluster_clean_a_folder(tmp_path: Path, ray: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if ray:
+        pytest.importorskip("ray", reason="the extra 'ray' is not installed")
+        monkeypatch.setenv("RAY_raylet_start_wait_time_s", "120")  # on a busy machine it takes longer than the usual 30
     source, out = a_folder(tmp_path / "in"), tmp_path / "out"
-    assert clean(source, out, settings=options, jobs=2) == 1, "one is broken"
+    assert clean(source, out, jobs=None if ray else 2, ray=ray) == 1, "one is broken"
     assert names(out) == {"manifest.jsonl", "a.npz", "day/b.npz", "day/c/c_0.mcap", "day/c/metadata.yaml"}
     told = {line["input"]: line for line in lines(out)}
     assert {name: line["state"] for name, line in told.items()} == {
@@ -87,43 +71,42 @@ def test_processes_clean_a_folder(tmp_path: Path, options: tuple[str, ...], sett
     }  # fmt: skip
     assert "cannot be read as .npz" in told["broken.npz"]["error"]
     assert (told["a.npz"]["frames"], told["a.npz"]["poses"]) == (FRAMES, FRAMES)
-    clean_recording(source / "a.npz", tmp_path / "alone.npz", settings)
+    clean_recording(source / "a.npz", tmp_path / "alone.npz", DEFAULT)
     with np.load(out / "a.npz") as many, np.load(tmp_path / "alone.npz") as alone:
         for name in alone.files:
             np.testing.assert_array_equal(many[name], alone[name])
 
 
-def test_what_is_done_is_not_done_again(
-    tmp_path: Path, options: tuple[str, ...], here: list[Job], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_done_is_not_done_again(tmp_path: Path, here: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
     source, out = a_folder(tmp_path / "in"), tmp_path / "out"
-    assert clean(source, out, settings=options) == 1
+    assert clean(source, out) == 1
     assert len(here) == 4
     here.clear()
-    write_npz(source / "broken.npz")  # mended
-    write_npz(source / "day" / "b.npz", frames=FRAMES + 5)  # changed
+    write_npz(source / "broken.npz", WALK)  # mended
+    write_npz(source / "day" / "b.npz", WALK[5:])  # changed
     (out / "a.npz").unlink()  # lost
-    assert clean(source, out, settings=options) == 0
+    assert clean(source, out) == 0
     assert [job.source.name for job in here] == ["a.npz", "broken.npz", "b.npz"]
     here.clear()
-    assert clean(source, out, settings=options) == 0
+    assert clean(source, out) == 0
     assert not here
-    assert clean(source, out, settings=(*options, "person.enabled=false")) == 0
+    assert clean(source, out, settings=("person.enabled=false",)) == 0
     assert len(here) == 4, "other settings, other results"
     here.clear()
     monkeypatch.setattr(batch, "_models", lambda: "of another release")
-    assert clean(source, out, settings=(*options, "person.enabled=false")) == 0
+    assert clean(source, out, settings=("person.enabled=false",)) == 0
     assert len(here) == 4, "other models, other results"
 
 
-def test_the_last_line_cut_short_does_not_spoil_the_next(tmp_path: Path, options, here: list[Job]) -> None:
+def test_the_last_line_cut_short_does_not_spoil_the_next(tmp_path: Path, here: list[Job]) -> None:
     source, out = tmp_path / "in", tmp_path / "out"
-    write_npz(source / "a.npz")
+    source.mkdir()
     out.mkdir()
+    write_npz(source / "a.npz", WALK)
     (out / "manifest.jsonl").write_text('{"input": "a.npz", "sta')
-    assert clean(source, out, settings=options) == 0
+    assert clean(source, out) == 0
     here.clear()
-    assert clean(source, out, settings=options) == 0
+    assert clean(source, out) == 0
     assert not here
 
 
@@ -143,18 +126,9 @@ def test_a_process_that_dies_takes_one_recording_with_it(tmp_path: Path) -> None
     assert all("cannot be read as .npz" in error for error in results[1::2])
 
 
-def test_a_process_that_died_between_two_recordings_takes_one_with_it(tmp_path: Path) -> None:
-    worker = object.__new__(_Worker)
-    worker.connection, theirs = multiprocessing.Pipe()
-    worker.process = Mock(wait=lambda: -9)
-    theirs.close()
-    worker.send(Job(tmp_path / "a.npz", tmp_path / "b.npz"))
-    assert worker.receive() == {"state": "failed", "error": "the process that cleaned it ended with status -9"}
-
-
-def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = record(tmp_path / "in", walk(FRAMES))
-    clean_recording(source, tmp_path / "out", settings)
+    clean_recording(source, tmp_path / "out", DEFAULT)
     before = names(tmp_path)
 
     def fail(*_: object) -> None:
@@ -162,27 +136,27 @@ def test_an_output_is_whole_or_not_there(tmp_path: Path, settings, monkeypatch: 
 
     monkeypatch.setattr("steadypose.nodes.commands.output.RecordingWriter.write", fail)
     with pytest.raises(OSError, match="no space"):
-        clean_recording(source, tmp_path / "out", settings, replace=True)
+        clean_recording(source, tmp_path / "out", DEFAULT, replace=True)
     with pytest.raises(LaunchError, match="or --force to replace it"):
-        clean_recording(source, tmp_path / "out", settings)
+        clean_recording(source, tmp_path / "out", DEFAULT)
     assert names(tmp_path) == before
 
 
-def test_nothing_is_replaced_that_was_not_made_here(tmp_path: Path, options, here: list[Job]) -> None:
+def test_nothing_is_replaced_that_was_not_made_here(tmp_path: Path, here: list[Job]) -> None:
     source, out = tmp_path / "in", tmp_path / "out"
     record(source / "a", walk(FRAMES))
-    write_npz(source / "b.npz")
+    write_npz(source / "b.npz", WALK)
     (out / "a").mkdir(parents=True)
     (out / "a" / "thesis.txt").write_text("years of work")
     (out / "b.npz").write_text("mine")
     (out / "manifest.jsonl").write_text('{"name": "a manifest", "of": "somebody else"}\n')
     before = {path: path.read_text() for path in out.rglob("*") if path.is_file()}
     with pytest.raises(LaunchError, match="is not of an earlier call"):
-        clean(source, out, settings=options)
+        clean(source, out)
     # nor with a manifest of ours that knows nothing of it
     (out / "manifest.jsonl").write_text("")
     before[out / "manifest.jsonl"] = ""
-    assert clean(source, out, settings=options) == 1
+    assert clean(source, out) == 1
     assert [line["error"].partition(":")[2] for line in lines(out)] == [
         " expected a new path, or --force to replace it"
     ] * 2
@@ -190,16 +164,16 @@ def test_nothing_is_replaced_that_was_not_made_here(tmp_path: Path, options, her
     assert (out / "b.npz").read_text() == "mine"
     for path in (out / "a", out / "b.npz"):
         with pytest.raises(LaunchError, match="--force"):
-            clean(source / path.name, path, settings=options)
+            clean(source / path.name, path)
     with pytest.raises(LaunchError, match=r"is no recording, and is not replaced: .* holds thesis.txt"):
-        clean(source / "a", out / "a", settings=options, force=True)
+        clean(source / "a", out / "a", force=True)
     assert (out / "a" / "thesis.txt").read_text() == "years of work"
     (out / ".c.part").mkdir()
     (out / ".c.part" / "also mine").touch()
     with pytest.raises(LaunchError, match="is in the way, and was not made here"):
-        clean(source / "a", out / "c", settings=options)
+        clean(source / "a", out / "c")
     assert (out / ".c.part" / "also mine").exists()
-    assert clean(source / "b.npz", out / "b.npz", settings=options, force=True) == 0
+    assert clean(source / "b.npz", out / "b.npz", force=True) == 0
     with np.load(out / "b.npz") as cleaned:
         assert len(cleaned["positions"]) == FRAMES
 
@@ -211,7 +185,8 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
     for name in ("x", "y"):
         (tmp_path / "loose").mkdir(exist_ok=True)
         (tmp_path / "loose" / f"{name}.mcap").write_bytes((killed / "killed_0.mcap").read_bytes())
-    write_npz(tmp_path / ".hidden" / "a.npz", frames=2)
+    (tmp_path / ".hidden").mkdir()
+    write_npz(tmp_path / ".hidden" / "a.npz", WALK)
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "table.csv").touch()
     assert [is_folder_of_recordings(path) for path in (one, killed, tmp_path / "loose", tmp_path)] == [
@@ -226,62 +201,27 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("out", "more", "expected"),
+    ("source", "out", "more", "expected"),
     [
-        ("in/out", {}, "apart from"),
-        ("used", {}, "manifest.jsonl of an earlier call"),
-        ("out", {"jobs": 0}, "expected 1 or more, got 0"),
-        ("out", {"jobs": 2, "ray": True}, "Ray decides"),
-        ("out", {"settings": ("refine.enabeld=false",)}, "did you mean 'refine.enabled'"),
+        ("in", "in/out", {}, "apart from"),
+        ("in", "used", {}, "manifest.jsonl of an earlier call"),
+        ("in", "out", {"jobs": 0}, "expected 1 or more, got 0"),
+        ("in", "out", {"jobs": 2, "ray": True}, "Ray decides"),
+        ("empty", "out", {}, "expected recordings"),
+        ("twice", "out", {}, "would both become"),
+        ("in/a.npz", "out", {"jobs": 2}, "--jobs: expected a folder"),
     ],
 )
-def test_what_cannot_be_done_is_said(tmp_path: Path, out: str, more: dict[str, Any], expected: str) -> None:
-    source = write_npz(tmp_path / "in" / "a.npz").parent
-    (tmp_path / "used").mkdir()
-    (tmp_path / "used" / "letter.txt").write_text("mine")
-    with pytest.raises(LaunchError, match=expected):
-        clean(source, tmp_path / out, **more)
-    assert not (tmp_path / "out").exists()
-
-
-def test_folders_that_hold_nothing_or_two_of_a_name(tmp_path: Path) -> None:
-    with pytest.raises(LaunchError, match="expected recordings"):
-        clean(tmp_path, tmp_path.parent / "out")
-    record(tmp_path / "walk", walk(2))
-    (tmp_path / "walk.mcap").write_bytes((tmp_path / "walk" / "walk_0.mcap").read_bytes())
-    (tmp_path / "other.mcap").write_bytes(b"")
-    with pytest.raises(LaunchError, match="would both become"):
-        clean(tmp_path, tmp_path.parent / "out")
-
-
-def test_jobs_are_for_folders(tmp_path: Path) -> None:
-    with pytest.raises(LaunchError, match="--jobs: expected a folder"):
-        clean(write_npz(tmp_path / "a.npz"), tmp_path / "b.npz", jobs=2)
-
-
-def test_a_ray_cluster_gives_the_same(
-    tmp_path: Path, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+def test_what_cannot_be_done_is_said(
+    tmp_path: Path, source: str, out: str, more: dict[str, Any], expected: str
 ) -> None:
-    ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", "120")  # on a busy machine it takes longer than the usual 30
-    source, out = a_folder(tmp_path / "in"), tmp_path / "out"
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
-    try:
-        assert batch.clean_folder(source, out, settings, None, True, Console(stderr=True)) == 1
-    finally:
-        ray.shutdown()
-    assert sorted(line["state"] for line in lines(out) if line["state"] != "started") == [
-        "done",
-        "done",
-        "done",
-        "failed",
-    ]
-    clean_recording(source / "a.npz", tmp_path / "alone.npz", settings)
-    with np.load(out / "a.npz") as many, np.load(tmp_path / "alone.npz") as alone:
-        np.testing.assert_array_equal(many["world_positions"], alone["world_positions"])
-
-
-def test_without_ray_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match=r"the extra .ray."):
-        list(batch.on_ray([], {}))
+    for name in ("in", "used", "empty", "twice"):
+        (tmp_path / name).mkdir()
+    write_npz(tmp_path / "in" / "a.npz", WALK)
+    (tmp_path / "used" / "letter.txt").write_text("mine")
+    record(tmp_path / "twice" / "walk", walk(2))
+    (tmp_path / "twice" / "walk.mcap").write_bytes((tmp_path / "twice" / "walk" / "walk_0.mcap").read_bytes())
+    (tmp_path / "twice" / "other.mcap").write_bytes(b"")
+    with pytest.raises(LaunchError, match=expected):
+        clean(tmp_path / source, tmp_path / out, **more)
+    assert not (tmp_path / "out").exists()

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import write_npz
 from tests.helpers.bodies import waving
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.complete import complete
-from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.complete.stream import CompletionError
 from steadypose.prior.fit import optimise
-
-
-def write(path: Path, positions: np.ndarray, **more: object) -> Path:
-    arrays = {"positions": positions, "skeleton": "smpl22", "fps": 30.0} | more
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})  # type: ignore[arg-type]
-    return path
 
 
 def test_key_frames_become_motion_and_stay_what_they_are(tmp_path: Path, capsys) -> None:
     positions = waving(91)
     keys = np.arange(0, 91, 15)
     stamps = 10**9 + np.round(keys * 1e9 / 30).astype(np.int64)
-    source = write(tmp_path / "keys.npz", positions[keys], stamp_ns=stamps, fps=None)
+    source = write_npz(tmp_path / "keys.npz", positions[keys], stamp_ns=stamps)
     assert complete(source, tmp_path / "out.npz", picture=tmp_path / "out.png") == 0
     out = np.load(tmp_path / "out.npz")
     assert out["positions"].shape == (91, 22, 3)
@@ -46,10 +40,10 @@ def test_no_confidence_is_as_good_as_no_joint_and_a_recording_comes_of_it(tmp_pa
     positions = waving(40)
     confidence = np.ones((40, 22))
     confidence[:, J["right_wrist"]] = 0.0
-    complete(write(tmp_path / "in.npz", positions, confidence=confidence), tmp_path / "a")
+    complete(write_npz(tmp_path / "in.npz", positions, confidence=confidence), tmp_path / "a")
     hidden = positions.copy()
     hidden[:, J["right_wrist"]] = np.nan
-    complete(write(tmp_path / "nan.npz", hidden), tmp_path / "b.npz")
+    complete(write_npz(tmp_path / "nan.npz", hidden), tmp_path / "b.npz")
     with RecordingReader(tmp_path / "a") as recording:
         assert {POSE_RAW, POSE_CLEAN, POSE_WORLD} <= set(recording.topics)
         cleaned = [m for _, _, m in recording.messages([POSE_CLEAN]) if isinstance(m, PoseClean) and m.bodies]
@@ -62,9 +56,9 @@ def test_no_confidence_is_as_good_as_no_joint_and_a_recording_comes_of_it(tmp_pa
 def test_another_axis_may_point_up(tmp_path: Path) -> None:
     positions = waving(30)
     positions[10:20] = np.nan
-    complete(write(tmp_path / "z.npz", positions), tmp_path / "z_out.npz")
+    complete(write_npz(tmp_path / "z.npz", positions), tmp_path / "z_out.npz")
     turned = np.stack([positions[..., 0], -positions[..., 2], positions[..., 1]], axis=-1)
-    complete(write(tmp_path / "y.npz", turned, up="-y"), tmp_path / "y_out.npz")
+    complete(write_npz(tmp_path / "y.npz", turned, up="-y"), tmp_path / "y_out.npz")
     z, y = (np.load(tmp_path / f"{name}_out.npz") for name in ("z", "y"))
     expected = np.stack([z["positions"][..., 0], -z["positions"][..., 2], z["positions"][..., 1]], axis=-1)
     assert np.allclose(y["positions"], expected, atol=1e-4)
@@ -74,19 +68,19 @@ def test_another_axis_may_point_up(tmp_path: Path) -> None:
 def test_several_people_and_one_who_was_away(tmp_path: Path) -> None:
     positions = np.stack([waving(60), waving(60) + [2.0, 0.0, 0.0]], axis=1)
     positions[20:30, 0] = np.nan
-    complete(write(tmp_path / "two.npz", positions), tmp_path / "out.npz")
+    complete(write_npz(tmp_path / "two.npz", positions), tmp_path / "out.npz")
     out = np.load(tmp_path / "out.npz")
     assert out["positions"].shape == (60, 2, 22, 3)
     assert np.isfinite(out["positions"]).all()
     long = np.full((400, 22, 3), np.nan)
     long[:40], long[-40:] = waving(40), waving(40)
-    complete(write(tmp_path / "away.npz", long), tmp_path / "away_out.npz")
+    complete(write_npz(tmp_path / "away.npz", long), tmp_path / "away_out.npz")
     assert len(np.load(tmp_path / "away_out.npz")["stamp_ns"]) == 80, "nobody knows what happened in ten seconds"
 
 
 def test_who_stands_on_the_pelvis_is_given_a_way(tmp_path: Path, capsys) -> None:
     positions = waving(60)
-    complete(write(tmp_path / "in.npz", positions - positions[:, :1]), tmp_path / "out.npz")
+    complete(write_npz(tmp_path / "in.npz", positions - positions[:, :1]), tmp_path / "out.npz")
     assert "the path is predicted from the motion" in capsys.readouterr().err
     out = np.load(tmp_path / "out.npz")
     assert np.ptp(out["positions"][:, 0], axis=0).max() < 1e-6
@@ -98,7 +92,7 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
     monkeypatch.setattr(optimise, "DECODER_STEPS", 1)
     positions = waving(30)
     positions[10:20] = np.nan
-    source = write(tmp_path / "in.npz", positions)
+    source = write_npz(tmp_path / "in.npz", positions)
     complete(source, tmp_path / "out.npz")
     complete(source, tmp_path / "searched.npz", optimise=True)
     found, searched = (np.load(tmp_path / f"{name}.npz")["positions"] for name in ("out", "searched"))
@@ -107,23 +101,31 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
     assert 1e-4 < np.abs(searched - found)[10:20].max() < 0.2
 
 
-def test_what_cannot_be_is_said(tmp_path: Path) -> None:
-    source = write(tmp_path / "in.npz", waving(20))
-    with pytest.raises(LaunchError, match="nothing is written in place"):
-        complete(source, source)
-    with pytest.raises(LaunchError, match="make it first"):
-        complete(source, tmp_path / "no" / "out.npz")
-    with pytest.raises(LaunchError, match=r"ending in \.png"):
-        complete(source, tmp_path / "out.npz", picture=tmp_path / "a.txt")
-    with pytest.raises(FileNotFoundError, match="no weights 'nobody'"):
-        complete(source, tmp_path / "out.npz", weights="nobody")
-    with pytest.raises(CompletionError, match="expected metres"):
-        complete(write(tmp_path / "mm.npz", waving(20) * 1000), tmp_path / "out.npz")
-    with pytest.raises(CompletionError, match="expected a body with joints"):
-        complete(write(tmp_path / "none.npz", np.full((5, 22, 3), np.nan)), tmp_path / "out.npz")
+@pytest.mark.parametrize(
+    ("out", "more", "said"),
+    [
+        ("in.npz", {}, "nothing is written in place"),
+        ("no/out.npz", {}, "make it first"),
+        ("out.npz", {"picture": Path("a.txt")}, r"ending in \.png"),
+        ("out.npz", {"weights": "nobody"}, "no weights 'nobody'"),
+        ("out.npz", {"source": Path("mm.npz")}, "expected metres"),
+        ("out.npz", {"source": Path("none.npz")}, "expected a body with joints"),
+        ("mine.npz", {}, "--force"),
+    ],
+)
+def test_what_cannot_be_is_said(out: str, more: dict[str, Any], said: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_npz(Path("in.npz"), waving(20))
+    write_npz(Path("mm.npz"), waving(20) * 1000)
+    write_npz(Path("none.npz"), np.full((5, 22, 3), np.nan))
+    Path("mine.npz").write_text("mine")
+    asked: dict[str, Any] = {"source": Path("in.npz"), "out": Path(out)} | more
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        complete(**asked)
+    assert Path("mine.npz").read_text() == "mine"
+
+
+def test_what_is_there_is_replaced_if_that_is_asked_for(tmp_path: Path) -> None:
     (tmp_path / "out.npz").write_text("mine")
-    with pytest.raises(LaunchError, match="--force"):
-        complete(source, tmp_path / "out.npz")
-    assert (tmp_path / "out.npz").read_text() == "mine"
-    complete(source, tmp_path / "out.npz", force=True)
+    complete(write_npz(tmp_path / "in.npz", waving(20)), tmp_path / "out.npz", force=True)
     assert np.load(tmp_path / "out.npz")["positions"].shape == (20, 22, 3)

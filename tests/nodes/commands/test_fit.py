@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from conftest import walk
+from conftest import walked, write_npz
 from tests.helpers.smpl_model import model_arrays
 
 from steadypose.msgs.recording import RecordingReader
@@ -37,6 +37,7 @@ from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.mocap.files import read_amass
 
 FRAMES = 24
+POSITIONS = walked(FRAMES)
 
 
 @pytest.fixture(autouse=True)
@@ -45,15 +46,9 @@ def brief(monkeypatch) -> None:
     monkeypatch.setattr(solve, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
 
 
-def positions() -> np.ndarray:
-    return np.array([frame.bodies[0].positions for frame in walk(FRAMES, 1)])
-
-
 @pytest.fixture
 def seen(tmp_path: Path) -> Path:
-    path = tmp_path / "in.npz"
-    np.savez(path, positions=positions(), skeleton="smpl22", fps=30.0)
-    return path
+    return write_npz(tmp_path / "in.npz", POSITIONS)
 
 
 @pytest.fixture
@@ -65,7 +60,7 @@ def pictured(tmp_path: Path) -> Path:
 
 
 def in_camera() -> np.ndarray:
-    body = positions().astype(float)
+    body = POSITIONS.astype(float)
     return np.stack([-body[..., 1], 1.3 - body[..., 2], 4.0 + body[..., 0] - body[:, :1, 0].mean()], axis=-1)
 
 
@@ -84,7 +79,7 @@ def test_arrays_in_and_out(seen: Path, tmp_path: Path, capsys) -> None:
         for name in ("positions", "rotations", "world_positions", "root_velocity", "contacts"):
             assert np.isfinite(out[name]).all(), name
         lengths = np.linalg.norm(out["positions"][:, 4] - out["positions"][:, 1], axis=-1)
-        off = np.linalg.norm(out["positions"] - positions(), axis=-1)
+        off = np.linalg.norm(out["positions"] - POSITIONS, axis=-1)
     np.testing.assert_allclose(lengths, lengths[0], atol=1e-3)
     assert off.mean() < 0.05
     with np.load(tmp_path / "out.npz.misfit.npz") as misfit:
@@ -129,9 +124,9 @@ def test_points_of_the_surface_say_where_somebody_is(tmp_path: Path) -> None:
         assert np.linalg.norm(out["positions"] - truth, axis=-1).mean() < 0.1
 
 
-@pytest.mark.parametrize("nothing", [np.nan, np.inf, 0.0, 1e30])
-def test_points_of_nobody_are_as_none(nothing: float, tmp_path: Path) -> None:
-    np.savez(tmp_path / "keys.npz", **key_points(points=np.full((FRAMES, 5, 3), nothing)))
+def test_points_of_nobody_are_as_none(tmp_path: Path) -> None:
+    nothing = np.array([np.nan, np.inf, 0.0, 1e30])
+    np.savez(tmp_path / "keys.npz", **key_points(points=np.tile(nothing[:, None], (FRAMES, 1, 3))))
     assert main(["fit", str(tmp_path / "keys.npz"), str(tmp_path / "out.npz")]) == 0
     with np.load(tmp_path / "out.npz") as out:
         assert np.isfinite(out["positions"]).all()
@@ -154,43 +149,21 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
     assert "expected an .npz archive" in capsys.readouterr().err
 
 
-def test_what_is_there_is_kept(seen: Path, tmp_path: Path, capsys) -> None:
-    out = tmp_path / "out.npz"
-    out.write_bytes(b"mine")
-    assert main(["fit", str(seen), str(out)]) == 2
-    assert "--force" in capsys.readouterr().err
-    assert out.read_bytes() == b"mine"
-    assert main(["fit", str(seen), str(out), "--force"]) == 0
-    assert out.read_bytes()[:2] == b"PK"
-
-
 @pytest.mark.parametrize(
     ("source", "out", "says"),
     [
         ("nowhere.npz", "out.npz", "does not exist"),
-        ("in.npz", "in.npz", "in place"),
-        ("in.npz", "nowhere/out.npz", "make it first"),
+        ("in.npz", "keys.npz", "--force"),
+        ("empty.npz", "out.npz", "found nobody"),
         ("keys.npz", "out", "expected an .npz"),
     ],
 )
 def test_what_cannot_be_done_is_said(
     source: str, out: str, says: str, seen: Path, pictured: Path, tmp_path: Path, capsys
 ) -> None:
+    write_npz(tmp_path / "empty.npz", np.full((FRAMES, 22, 3), np.nan))
     assert main(["fit", str(tmp_path / source), str(tmp_path / out)]) == 2
     assert says in capsys.readouterr().err
-
-
-def test_without_torch_it_says_what_to_install(seen: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
-    assert main(["fit", str(seen), str(tmp_path / "out.npz")]) == 2
-    assert "add train" in capsys.readouterr().err
-
-
-def test_nobody_in_it_is_said(tmp_path: Path, capsys) -> None:
-    path = tmp_path / "empty.npz"
-    np.savez(path, positions=np.full((FRAMES, 22, 3), np.nan), skeleton="smpl22", fps=30.0)
-    assert main(["fit", str(path), str(tmp_path / "out.npz")]) == 2
-    assert "found nobody" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

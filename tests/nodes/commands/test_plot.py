@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +12,37 @@ from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw
+from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw
 from steadypose.nodes.commands.plot import plot
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, read_history
 from steadypose.nodes.sinks.plot.panels import busiest_joints
 from steadypose.prior.body.skeleton import J
 
-PICTURE = b"\x89PNG"
+GONE = object()
+"""Returned for a message that is to go."""
+EVERY = {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}
 
 
-def record(directory: Path, topics: Collection[str], seconds: float = 3.0, **options) -> Path:
+def record(
+    directory: Path,
+    seconds: float,
+    topics: Collection[str] = EVERY,
+    change: Callable[[str, Message], object] = lambda *_: None,
+    **options,
+) -> Path:
+    """What is made up, each message changed."""
     with RecordingWriter(directory) as writer:
         for topic, message in messages(seconds, **options):
-            if topic in topics:
+            if topic in topics and change(topic, message) is not GONE:
                 writer.write(topic, message, message.stamp_ns)
     return directory
+
+
+def drawn(recording: Path) -> bool:
+    picture = recording.with_suffix(".png")
+    plot(recording, picture)
+    return picture.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
@@ -37,37 +52,32 @@ def record(directory: Path, topics: Collection[str], seconds: float = 3.0, **opt
             pytest.param(topics, marks=pytest.mark.slow)
             for topics in ({POSE_RAW}, {POSE_CLEAN}, {POSE_WORLD, POSE_TRUTH})
         ),
-        {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH},
+        EVERY,
     ],
     ids=lambda topics: "+".join(sorted(topic.removeprefix("pose/") for topic in topics)),
 )
 @pytest.mark.filterwarnings("error")
 def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
-    plot(record(tmp_path / "bag", topics), tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+    assert drawn(record(tmp_path / "bag", 3.0, topics))
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("frames", [1, 2])
 def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, frames: int) -> None:
-    recording = record(tmp_path / "bag", {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}, (4 + frames) / 30)
-    plot(recording, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+    assert drawn(record(tmp_path / "bag", (4 + frames) / 30))
 
 
 @pytest.mark.filterwarnings("error")
 def test_draws_frames_in_which_nothing_is_seen(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(1.0):
-            if isinstance(message, PoseRaw):
-                message.bodies[0].positions[:] = np.nan
-            if isinstance(message, PoseClean):
-                message.bodies[0].raw_positions[:] = np.nan
-                message.bodies[0].anomaly = np.nan
-            writer.write(topic, message, message.stamp_ns)
-    plot(tmp_path / "bag", tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").read_bytes().startswith(PICTURE)
+    def hide(_: str, message: Message) -> None:
+        if isinstance(message, PoseRaw):
+            message.bodies[0].positions[:] = np.nan
+        if isinstance(message, PoseClean):
+            message.bodies[0].raw_positions[:] = np.nan
+            message.bodies[0].anomaly = np.nan
+
+    assert drawn(record(tmp_path / "bag", 1.0, change=hide))
 
 
 def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
@@ -88,64 +98,52 @@ def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
 
 
 def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(1.0, bodies=2):
-            if isinstance(message, PoseRaw):
-                for body in message.bodies:
-                    body.id = 7 - body.id
-            writer.write(topic, message, message.stamp_ns)
-    history = read_history(tmp_path / "bag")
+    def renumber(_: str, message: Message) -> None:
+        for body in message.bodies if isinstance(message, PoseRaw) else ():
+            body.id = 7 - body.id
+
+    history = read_history(record(tmp_path / "bag", 1.0, change=renumber, bodies=2))
     assert errors_of(history, 7)[POSE_RAW].mean.max() < 0.1
 
 
 def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(3.0):
-            if isinstance(message, PoseRaw):
-                message.calibrated = False
-                turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(
-                    message.sensor_pose.orientation
-                )
-                message.sensor_pose = Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
-            writer.write(topic, message, message.stamp_ns)
-    errors = errors_of(read_history(tmp_path / "bag"), 0)
+    def misplace(_: str, message: Message) -> None:
+        if isinstance(message, PoseRaw):
+            turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(message.sensor_pose.orientation)
+            message.calibrated, message.sensor_pose = False, Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
+
+    errors = errors_of(read_history(record(tmp_path / "bag", 3.0, change=misplace)), 0)
     assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
 
 
 def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(3.0):
-            if topic != POSE_TRUTH or not 2e9 < message.stamp_ns < 3e9:
-                writer.write(topic, message, message.stamp_ns)
-    history = read_history(tmp_path / "bag")
-    times = errors_of(history, 0)[POSE_RAW].time
+    def silence(topic: str, message: Message) -> object:
+        return GONE if topic == POSE_TRUTH and 2e9 < message.stamp_ns < 3e9 else None
+
+    times = errors_of(read_history(record(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
     assert not ((times > 1.1) & (times < 1.9)).any()
 
 
 def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
-    history = read_history(record(tmp_path / "bag", {POSE_CLEAN}, 4.0))
+    history = read_history(record(tmp_path / "bag", 4.0, {POSE_CLEAN}))
     track = history.track(POSE_CLEAN, 0)
     assert track is not None
     assert busiest_joints(track)[0] == J["left_wrist"]
 
 
 @pytest.mark.parametrize(
-    ("output", "options", "expected"),
+    ("bodies", "output", "options", "expected"),
     [
-        ("picture.gif", {}, "ending in .png, .svg or .pdf"),
-        ("nowhere/picture.png", {}, "no directory; make it first"),
-        ("picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
+        (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
+        (1, "nowhere/picture.png", {}, "no directory; make it first"),
+        (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
+        (0, "picture.png", {}, "found none"),
     ],
 )
-def test_what_cannot_be_drawn_says_why(tmp_path: Path, output: str, options: dict, expected: str) -> None:
-    recording = record(tmp_path / "bag", {POSE_RAW}, 0.2)
+def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
+    recording = record(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
     with pytest.raises(PlotError, match=expected):
         plot(recording, tmp_path / output, **options)
-
-
-def test_a_recording_without_bodies_says_so(tmp_path: Path) -> None:
-    with pytest.raises(PlotError, match="found none"):
-        plot(record(tmp_path / "bag", {POSE_RAW}, 0.2, bodies=0), tmp_path / "picture.png")
 
 
 def test_what_is_not_one_recording_says_what_to_draw(tmp_path: Path) -> None:

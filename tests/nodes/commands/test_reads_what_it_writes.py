@@ -108,9 +108,3 @@ def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
     origin, up, left = view(np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
     assert up[1] > origin[1] + 0.9
     assert left[0] > origin[0] + 0.8
-
-
-@pytest.mark.parametrize("out", ["out.json", "out.bvh", "out.npy"])
-def test_another_ending_is_answered_with_what_there_is(cleaned: Path, out: str, tmp_path: Path, capsys) -> None:
-    assert main(["clean", str(cleaned / "walk.npz"), str(tmp_path / out)]) == 2
-    assert "expected .npz or .csv for arrays, or a name without ending for a recording" in capsys.readouterr().err

@@ -50,25 +50,22 @@ def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
 
 
 def test_the_nodes_and_clean_give_the_same_bytes_every_time(
-    tmp_path: Path, stream: Path, weights: dict[str, str], make_launch: Callable[..., Launch]
+    tmp_path: Path, stream: Path, make_launch: Callable[..., Launch]
 ) -> None:
     """The second time the nodes play what they recorded the first time, which is as good as its source."""
-    settings = {**weights, "nodes": NODES, "input.rate": "0"}
+    settings = {"nodes": NODES, "input.rate": "0"}
     for source, name in ((stream, "first"), (tmp_path / "first", "second")):
         replay(make_launch({**settings, "input.recording": str(source)}, recorder__directory=tmp_path / name))
     first = payloads(tmp_path / "first")
     assert len(first[POSE_RAW]) == FRAMES + 1
     assert len(first[POSE_CLEAN]) == len(first[POSE_WORLD]) >= FRAMES
     assert payloads(tmp_path / "second") == first
-    options = tuple(f"{key.removeprefix('prior.')}={value}" for key, value in weights.items())
-    clean(stream, tmp_path / "offline", settings=options)
+    clean(stream, tmp_path / "offline")
     assert payloads(tmp_path / "offline") == first
 
 
-def test_every_node_says_how_it_did(
-    tmp_path: Path, stream: Path, weights: dict[str, str], make_launch: Callable[..., Launch]
-) -> None:
-    settings = {**weights, "nodes": NODES, "input.recording": str(stream), "input.rate": "20"}
+def test_every_node_says_how_it_did(tmp_path: Path, stream: Path, make_launch: Callable[..., Launch]) -> None:
+    settings = {"nodes": NODES, "input.recording": str(stream), "input.rate": "20"}
     replay(make_launch(settings, recorder__directory=tmp_path / "out"))
     last: dict[str, Diagnostics] = {}
     with RecordingReader(tmp_path / "out") as reader:

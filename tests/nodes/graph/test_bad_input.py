@@ -120,14 +120,9 @@ COUNTED = {
 GARBAGE = (b"", b"\2\2\3", b"?" * 999, b"\2" + bytes(16), b"\2" + bytes(4) + b"\1" + bytes(11) + b"\xff" * 40)
 
 
-def settings(weights: dict[str, str]) -> tuple[dict, dict]:
-    return {"refine": {"weights": weights["prior.refine.weights"]}}, {"weights": weights["trajectory.weights"]}
-
-
 @pytest.mark.parametrize("kind", EVIL)
-def test_clean_gets_over_it(kind: str, weights: dict[str, str]) -> None:
-    prior_settings, trajectory_settings = settings(weights)
-    prior, trajectory = make_prior(prior_settings), make_trajectory(trajectory_settings)
+def test_clean_gets_over_it(kind: str) -> None:
+    prior, trajectory = make_prior({}), make_trajectory({})
     answers = list(stream([(POSE_RAW, frame) for frame in EVIL[kind]], prior, trajectory))
     cleans = [m for _, m in answers if isinstance(m, PoseClean) and not m.end_of_stream]
     worlds = [m for _, m in answers if isinstance(m, PoseWorld) and not m.end_of_stream]
@@ -145,9 +140,9 @@ def test_clean_gets_over_it(kind: str, weights: dict[str, str]) -> None:
 
 
 @pytest.mark.slow
-def test_no_node_goes_down(weights: dict[str, str], make_launch: Callable[..., Launch]) -> None:
+def test_no_node_goes_down(make_launch: Callable[..., Launch]) -> None:
     """All of it in a row over real sockets, with garbage in between."""
-    launch = make_launch(weights, nodes='["pose_input", "prior", "trajectory"]')
+    launch = make_launch(nodes='["pose_input", "prior", "trajectory"]')
     prior, trajectory = PriorNode(launch), TrajectoryNode(launch)
     address = launch.transport.endpoint("pose_input")
     with (
@@ -205,11 +200,10 @@ def test_bytes_that_are_not_even_zeromq(make_launch: Callable[..., Launch]) -> N
         context.term()
 
 
-def test_clean_counts_and_goes_on(tmp_path: Path, weights: dict[str, str], capsys) -> None:
+def test_clean_counts_and_goes_on(tmp_path: Path, capsys) -> None:
     frames = EVIL["unknown skeleton"]
     record(tmp_path / "in", frames)
-    options = tuple(f"{key.removeprefix('prior.')}={value}" for key, value in weights.items())
-    clean(tmp_path / "in", tmp_path / "out.npz", settings=options)
+    clean(tmp_path / "in", tmp_path / "out.npz")
     with np.load(tmp_path / "out.npz") as out:
         assert len(out["stamp_ns"]) == len(frames)
         assert np.isfinite(out["positions"][-1]).all()

@@ -107,12 +107,9 @@ def poses_recorded(directory: Path) -> bool:
     return bool(files) and files[0].stat().st_size > 50_000
 
 
-def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(
-    start: Any, tmp_path: Path, weights: dict[str, str]
-) -> None:
+def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(start: Any, tmp_path: Path) -> None:
     record(tmp_path / "in", walk(150))
-    settings = [part for key, value in weights.items() for part in ("--set", f"{key}={value}")]
-    run: Run = start("--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"), *settings)
+    run: Run = start("--input", str(tmp_path / "in"), "--record", str(tmp_path / "out"))
     until(lambda: poses_recorded(tmp_path / "out"), timeout_s=240)
     os.kill(run.pid("prior"), signal.SIGKILL)
     status, output = run.wait()

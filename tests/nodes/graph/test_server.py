@@ -30,7 +30,7 @@ def kiosk(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
 
 @pytest.mark.parametrize("secret", [False, True])
 def test_two_kiosks_and_a_server(
-    make_launch: Callable[..., Launch], tmp_path: Path, weights: dict[str, str], clock: VirtualClock, secret: bool
+    make_launch: Callable[..., Launch], tmp_path: Path, clock: VirtualClock, secret: bool
 ) -> None:
     streams = {"door": kiosk("door", 1, 0), "desk": kiosk("desk", 2, 3_600_000_000_000)}
     # kiosks and server have the same keys
@@ -39,7 +39,6 @@ def test_two_kiosks_and_a_server(
     with ExitStack() as stack:
         door, desk = (stack.enter_context(Publisher("tcp://127.0.0.1:*", keys=keys)) for _ in streams)
         launch = make_launch(
-            weights,
             nodes='["prior", "trajectory"]',
             server__clients=str([door.endpoint, desk.endpoint]),
             transport__lossless="false",

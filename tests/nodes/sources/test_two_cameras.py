@@ -47,12 +47,9 @@ def filmed(camera: str, hidden: range) -> list[PoseRaw]:
     return messages
 
 
-def test_two_cameras_become_one_world(
-    make_launch: Callable[..., Launch], folder: Path, weights: dict[str, str], clock: VirtualClock
-) -> None:
+def test_two_cameras_become_one_world(make_launch: Callable[..., Launch], folder: Path, clock: VirtualClock) -> None:
     addresses = {name: f"ipc://{folder}/{name}" for name in PLACES}
     launch = make_launch(
-        weights,
         input__source="merge",
         input__merge__cameras=str(list(addresses.values())),
         prior__identify__enabled="true",
