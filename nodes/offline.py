@@ -130,11 +130,8 @@ def fit_source(
         frames: the source.
         name: its name in errors.
         points: (T, N, 3) metres, points on the body's surface in the sensor's frame; padded with NaN.
-        model: as in `prior.fit.bodies.fit_stream`.
         delay: delay of the initial estimate, frames at 30 Hz.
-        folder: as in `prior.fit.bodies.fit_stream`.
-        began: as in `prior.fit.bodies.fit_stream`.
-        advanced: as in `prior.fit.bodies.fit_stream`.
+        model, folder, began, advanced: as in `prior.fit.bodies.fit_stream`.
 
     Raises:
         LaunchError: nobody is observed for long enough.

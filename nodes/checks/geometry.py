@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, tracks, warning
@@ -74,26 +75,18 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     """The problem of whole bodies that jump. The stamps must be valid nanoseconds."""
-    skeleton = SKELETONS.get(messages[-1].skeleton)
-    if skeleton is None:
+    paths = _paths(messages)
+    speeds = [np.zeros(0)]
+    for stamps, joints in paths:
+        intervals = np.diff(stamps)
+        moved = np.linalg.norm(np.diff(medians(joints, axis=1), axis=0), axis=-1)
+        speeds.append(moved[intervals > 0] / intervals[intervals > 0] * 1e9)
+    found = np.concatenate(speeds)
+    if len(found) < ENOUGH:
         return
-    whole = [
-        (raw.stamp_ns, body) for raw in messages for body in raw.bodies if len(body.positions) == len(skeleton.joints)
-    ]
-    if len(whole) < ENOUGH:
-        return
-    middles = medians(np.array([body.positions for _, body in whole]), axis=1)
-    last: dict[int, tuple[int, Floats]] = {}
-    speeds = []
-    for (stamp_ns, body), middle in zip(whole, middles, strict=True):
-        if body.id in last and stamp_ns > (before_ns := last[body.id][0]):
-            speeds.append(np.linalg.norm(middle - last[body.id][1]) / (stamp_ns - before_ns) * 1e9)
-        last[body.id] = stamp_ns, middle
-    if len(speeds) < ENOUGH:
-        return
-    joints = tracks(messages, len(skeleton.joints))
+    joints = tracks(messages, paths[0][1].shape[1])
     height = float(np.nanmax(np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1)))
-    if (fast := float(np.nanmedian(speeds))) > FASTEST * height > 0:
+    if (fast := float(np.nanmedian(found))) > FASTEST * height > 0:
         yield warning(
             "jumps",
             f"a body moves at {fast:.0f} units per second, {fast / height:.0f} times its height: expected less than "
@@ -104,18 +97,9 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
 def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     """The problem of a body that moves faster than people do, caused by a wrong rate or wrong stamps. In metres."""
-    skeleton = SKELETONS.get(messages[-1].skeleton)
-    if skeleton is None:
+    stamps, joints = max(_paths(messages), key=lambda path: len(path[0]), default=(np.zeros(0), np.zeros(0)))
+    if len(stamps) < ENOUGH:
         return
-    rows: dict[int, list[tuple[int, Floats]]] = {}
-    for raw in messages:
-        for body in raw.bodies:
-            if len(body.positions) == len(skeleton.joints):
-                rows.setdefault(body.id, []).append((raw.stamp_ns, body.positions))
-    longest = max(rows.values(), key=len, default=[])
-    if len(longest) < ENOUGH:
-        return
-    stamps, joints = np.array([stamp for stamp, _ in longest]), np.array([places for _, places in longest], np.float64)
     interval = max(float(np.median(np.diff(stamps))), 1.0)
     step = min(math.ceil(SPEED_BASE_NS / interval), len(stamps) // 2)
     seconds = (stamps[step:] - stamps[:-step]) * 1e-9
@@ -131,6 +115,20 @@ def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
             f"{what} for a second, which no person does, with frames {interval / 1e6:.3g} ms apart: expected times of "
             "capture; set fps to the rate at which the recording was made, such as 30, or give stamps of capture",
         )
+
+
+def _paths(messages: Sequence[PoseRaw]) -> list[tuple[NDArray[np.int64], Floats]]:
+    """Stamps (T,) and joints (T, J, 3) of each body that has all joints of its layout; of no body, if it is unknown."""
+    skeleton = SKELETONS.get(messages[-1].skeleton)
+    rows: dict[int, list[tuple[int, Floats]]] = {}
+    for raw in messages if skeleton else ():
+        for body in raw.bodies:
+            if skeleton and len(body.positions) == len(skeleton.joints):
+                rows.setdefault(body.id, []).append((raw.stamp_ns, body.positions))
+    return [
+        (np.array([stamp for stamp, _ in row]), np.array([joints for _, joints in row], np.float64))
+        for row in rows.values()
+    ]
 
 
 def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +59,10 @@ JUDGED = 4
 """Largest number of bodies per message whose joints are examined."""
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """A message and its time of arrival."""
+class Arrival(NamedTuple):
+    """A message, and the wall time of its arrival in nanoseconds since 1970."""
 
     at_ns: int
-    """wall time, nanoseconds since 1970"""
     raw: PoseRaw
 
 

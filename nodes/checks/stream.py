@@ -25,11 +25,7 @@ CHECKS = 3
 
 
 class Answers:
-    """Counts the pipeline's input and output between two checks.
-
-    Args:
-        counters: the pipeline's counters.
-    """
+    """Counts the pipeline's input and output between two checks, beside the pipeline's own counters."""
 
     def __init__(self, counters: Counter[str]) -> None:
         self._counters = counters
@@ -167,13 +163,7 @@ def _usable(problems: list[Problem]) -> bool:
 
 
 class StreamChecks:
-    """The checks of all streams of a prior: a single one, or one per client, identified by its source.
-
-    Args:
-        max_bodies: as in `StreamCheck`.
-        identified: as in `StreamCheck`.
-        streams: number of sources.
-    """
+    """The checks of all ``streams`` of a prior: a single one, or one per client, identified by its source."""
 
     def __init__(self, max_bodies: int, *, identified: bool, streams: int) -> None:
         self._new = partial(StreamCheck, max_bodies, identified=identified)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import traceback
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection, Pipe, wait
@@ -28,7 +28,7 @@ from rich.progress import Progress
 
 from steadypose.nodes.cli import is_for_user
 from steadypose.nodes.commands.output import clean_recording
-from steadypose.nodes.driving import NOBODY
+from steadypose.nodes.driving import NOBODY, Settings
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.settings import LaunchError
@@ -39,8 +39,6 @@ _LINE = '{"input": '
 """how each line of it begins"""
 FILES = (".npz", ".csv", *SUFFIXES)
 """endings of files of poses that are cleaned into an .npz each"""
-
-Settings = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -102,15 +100,7 @@ def plan(folder: Path, out: Path) -> list[Job]:
 
 
 def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, ray: bool, console: Console) -> int:
-    """Clean all recordings of a folder that are not cleaned yet.
-
-    Args:
-        folder: of recordings, at any depth.
-        out: the folder to make, or one that an earlier call made.
-        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
-        jobs: how many at once; as many as there are cores if None.
-        ray: on a Ray cluster rather than in processes of this machine.
-        console: for progress and what went wrong.
+    """Clean all recordings of a folder that are not cleaned yet: ``jobs`` at once (None: one a core), or with Ray.
 
     Returns:
         the exit status: 1 if one could not be cleaned, shows nobody, or could not be read to the end.
@@ -158,12 +148,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
 
 
 class Manifest:
-    """What became of each recording: ``manifest.jsonl`` in the output folder, a JSON object a line, the last counts.
-
-    Args:
-        out: the output folder; made if it is not there.
-        folder: of the recordings.
-        settings: with which they are cleaned.
+    """What became of each recording of ``folder``: ``out/manifest.jsonl``, a JSON object a line; the last counts.
 
     Raises:
         LaunchError: the output folder holds something else.

@@ -100,16 +100,8 @@ class PrintBoard:
 
 
 @dataclass(frozen=True)
-class CalibrateLens:
-    """Calibrate the lens from 15 to 25 images of the board.
-
-    Take images of the board near and far, tilted to all sides, in the middle and in every corner of the image. Keep the
-    board still each time, and use the resolution that you run with. An OAK camera stores its lens parameters: use the
-    step 'oak' instead.
-
-    Try:
-      steadypose calibrate lens kitchen.toml images/ --square 0.0561
-      steadypose calibrate lens kitchen.toml video.mp4 --square 0.0561
+class _OfBoard:
+    """What the steps with images of the board take.
 
     Args:
         launch: your launch file of this camera; the result is written to its [input.calibration].
@@ -125,13 +117,30 @@ class CalibrateLens:
     columns: int = Board.columns
     rows: int = Board.rows
 
+    @property
+    def board(self) -> Board:
+        return Board(self.columns, self.rows, self.square)
+
+
+@dataclass(frozen=True)
+class CalibrateLens(_OfBoard):
+    """Calibrate the lens from 15 to 25 images of the board.
+
+    Take images of the board near and far, tilted to all sides, in the middle and in every corner of the image. Keep the
+    board still each time, and use the resolution that you run with. An OAK camera stores its lens parameters: use the
+    step 'oak' instead.
+
+    Try:
+      steadypose calibrate lens kitchen.toml images/ --square 0.0561
+      steadypose calibrate lens kitchen.toml video.mp4 --square 0.0561
+    """
+
     def run(self) -> None:
         read_launch(self.launch)
-        board = Board(self.columns, self.rows, self.square)
         views, sizes, images = [], set(), 0
         for name, image in read_images(self.images):
             images += 1
-            view = find_corners(image, board)
+            view = find_corners(image, self.board)
             print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
             sizes.add(image.shape[1::-1])
             views += [view] if view else []
@@ -151,7 +160,7 @@ class CalibrateLens:
 
 
 @dataclass(frozen=True)
-class CalibratePose:
+class CalibratePose(_OfBoard):
     """Estimate the camera's pose from images of the board on the floor.
 
     Lay the board flat on the floor, 1 to 2.5 m from the camera, and take a few images; neither may move. The world's
@@ -163,24 +172,13 @@ class CalibratePose:
       steadypose calibrate pose kitchen.toml floor.jpg --square 0.0561
 
     Args:
-        launch: your launch file of this camera, with the lens; the pose is written to its [input.calibration].
-        images: image files, folders of them, or videos.
-        square: side of a square in metres, measured on the print.
-        columns: squares along the lower edge.
-        rows: squares along the left edge.
         picture: image to write, with the floor's grid drawn over it. Default: beside the launch file.
     """
 
-    launch: LaunchFile
-    images: Images
-    square: float = Board.square
-    columns: int = Board.columns
-    rows: int = Board.rows
     picture: FloorPicture = None
 
     def run(self) -> None:
         lens = lens_of(self.launch)
-        board = Board(self.columns, self.rows, self.square)
         views, last = [], None
         for name, image in read_images(self.images):
             if image.shape[1::-1] != lens.size:
@@ -188,7 +186,7 @@ class CalibratePose:
                     f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
                     f"{image.shape[1]} x {image.shape[0]}"
                 )
-            view, last = find_corners(image, board), image
+            view, last = find_corners(image, self.board), image
             print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
             views += [view] if view else []
         found = camera_pose(views, lens)

@@ -20,16 +20,15 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import VIDEOS
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.arrays import Floats
-from steadypose.prior.camera.calibration import (
-    CalibrationError,
-    Intrinsics,
-)
+from steadypose.prior.camera.calibration import CalibrationError, Intrinsics
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_STEP_S = 0.5
 """between the images taken from a video: nearer ones show the same again"""
 MAX_PICTURES = 60
 AXIS_PX = 4
+REACH_M = 6.0
+"""half the side of the grid that is drawn"""
 Image = NDArray[np.uint8]
 
 
@@ -95,23 +94,18 @@ def read_depth(file: Path) -> NDArray[np.integer]:
     return np.asarray(depth, np.int64)
 
 
-def draw_floor(image: Image, lens: Intrinsics, pose: Pose, reach: float = 6.0, step: float = 0.5) -> Image:
-    """An image (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
+def draw_floor(image: Image, lens: Intrinsics, pose: Pose) -> Image:
+    """A grey image (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
 
-    Args:
-        image: grey.
-        lens: of the camera.
-        pose: of the camera in the world.
-        reach: metres of grid around the point that the camera looks at, or stands above.
-        step: metres between lines.
+    The grid lies around the point that the camera looks at, or stands above.
     """
     drawn = np.ascontiguousarray(np.repeat(image[:, :, None], 3, axis=2))
     turn = Rotation.from_quat(pose.orientation)
     forward = turn.apply([0.0, 0.0, 1.0])
-    away = min(pose.position[2] / -forward[2], reach) if forward[2] < 0 else reach
+    away = min(pose.position[2] / -forward[2], REACH_M) if forward[2] < 0 else REACH_M
     middle = np.round((pose.position + away * forward)[:2])
-    ticks = np.arange(-reach, reach + step / 2, step)
-    along = np.linspace(-reach, reach, 400)
+    ticks = np.arange(-REACH_M, REACH_M + 0.25, 0.5)
+    along = np.linspace(-REACH_M, REACH_M, 400)
     lines: list[tuple[Floats, tuple[int, int, int], int]] = []
     for tick in ticks:
         for axis in (0, 1):

@@ -30,7 +30,6 @@ from steadypose.nodes.extras import EXTRAS, install_command
 
 if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
     from steadypose.msgs.types import PoseRaw
-    from steadypose.nodes.graph.clock import Clock
 
 
 def doctor(live: bool = False, launch: str = "replay") -> int:
@@ -67,19 +66,14 @@ LISTEN_NS = 3_000_000_000
 """Time in nanoseconds that a tracker is listened to."""
 
 
-def listen(launch_file: str, console: Console, clock: Clock | None = None) -> int:
-    """Listen for three seconds, to the tracker and to the nodes' `diagnostics`, and print what is wrong.
+def listen(launch_file: str, console: Console) -> int:
+    """Listen for three seconds, where a launch file says, to the tracker and to the nodes' `diagnostics`.
 
-    Args:
-        launch_file: whose addresses to listen at.
-        console: to print on.
-        clock: the system's.
+    Returns:
+        0 if nothing is wrong, otherwise 1; what is, is printed.
 
     Raises:
         LaunchError: the launch file cannot be used.
-
-    Returns:
-        0 if nothing is, otherwise 1.
     """
     from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
     from steadypose.msgs.transport import Subscriber
@@ -91,22 +85,16 @@ def listen(launch_file: str, console: Console, clock: Clock | None = None) -> in
     from steadypose.nodes.graph.topology import POSE_NODES
     from steadypose.prior.clean.settings import PriorSettings
 
-    clock = clock or SystemClock()
-    launch = Launch.read(launch_file)
+    clock, launch = SystemClock(), Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
     settings = launch.settings(PriorSettings)
     check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
-    addresses = launch.addresses("pose_input")
+    addresses, nodes_at = launch.addresses("pose_input"), [transport.endpoint(name) for name in POSE_NODES]
     reported: dict[str, str] = {}
     frames: list[PoseRaw] = []
     with (
         Subscriber(addresses, POSE_RAW, keys=keys, clear_text=transport.clear_text) as tracker,
-        Subscriber(
-            [transport.endpoint(name) for name in POSE_NODES],
-            DIAGNOSTICS,
-            keys=keys,
-            clear_text=transport.clear_text,
-        ) as nodes,
+        Subscriber(nodes_at, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as nodes,
         console.status(f"listening at {', '.join(addresses)}"),
     ):
         end_ns = clock.now_ns() + LISTEN_NS
@@ -160,31 +148,24 @@ def _examine(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
     try:
         found.extend(check())
     except Exception as error:  # one broken check must not hide the results of the others
-        found.append(Finding(_name(check), Verdict.BAD, f"{type(error).__name__}: {error}", INSTALL))
+        name = check.__name__.removeprefix("check_").replace("_", " ")
+        found.append(Finding(name, Verdict.BAD, f"{type(error).__name__}: {error}", INSTALL))
     return found
-
-
-def _name(check: Callable[[], Iterator[Finding]]) -> str:
-    return check.__name__.removeprefix("check_").replace("_", " ")
 
 
 PYTHONS = ((3, 10), (3, 13))
 """Oldest and newest Python for which all packages of an installation are available."""
-
-
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 
 
 def check_python() -> Iterator[Finding]:
     running = ".".join(map(str, sys.version_info[:3]))
-    oldest, newest = PYTHONS
-    good = oldest <= sys.version_info[:2] <= newest
-    fix = "" if good else f"install Python {_dotted(oldest)} to {_dotted(newest)}, and reinstall steadypose with it"
-    yield Finding("Python", Verdict.GOOD if good else Verdict.BAD, running, fix)
-
-
-def _dotted(number: tuple[int, int]) -> str:
-    return ".".join(map(str, number))
+    if PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
+        yield Finding("Python", Verdict.GOOD, running)
+    else:
+        oldest, newest = (f"{major}.{minor}" for major, minor in PYTHONS)
+        fix = f"install Python {oldest} to {newest}, and reinstall steadypose with it"
+        yield Finding("Python", Verdict.BAD, running, fix)
 
 
 def check_packages() -> Iterator[Finding]:

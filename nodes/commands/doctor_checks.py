@@ -112,7 +112,7 @@ def check_camera() -> Iterator[Finding]:
     except ImportError:  # the extra that brings it is told of above
         return
     devices = depthai.Device.getAllAvailableDevices()
-    plugged = [file for file in Path("/sys/bus/usb/devices").glob("*/idVendor") if _reads(file, LUXONIS_USB)]
+    plugged = [file for file in Path("/sys/bus/usb/devices").glob("*/idVendor") if LUXONIS_USB in file.read_text()]
     if devices:
         names = ", ".join(device.getDeviceId() for device in devices)
         yield Finding("OAK cameras", Verdict.GOOD, names)
@@ -130,13 +130,6 @@ def check_webcam() -> Iterator[Finding]:
         yield Finding("webcams", Verdict.NOTE, f"{', '.join(closed)} may not be opened by you", VIDEO_GROUP)
     else:
         yield Finding("webcams", Verdict.GOOD, ", ".join(camera.name for camera in cameras) or "none")
-
-
-def _reads(file: Path, text: str) -> bool:
-    try:
-        return file.read_text().strip() == text
-    except OSError:
-        return False
 
 
 MODELS = ("mixture", "hgvae", "occlusion", "trajectory", "contacts")

@@ -46,11 +46,7 @@ class InspectError(ValueError):
 def messages_of(
     target: str, topics: tuple[str, ...], launch: str | None, endpoints: tuple[str, ...], *, newest: bool = False
 ) -> Iterator[tuple[str, Message]]:
-    """What comes on a topic until Ctrl-C, or what is in a recording.
-
-    Args:
-        newest: of a topic, skip what could not be taken in time.
-    """
+    """What comes on a topic until Ctrl-C, if ``newest`` without what could not be taken in time; or a recording's."""
     if target in TOPICS:
         if topics:
             raise InspectError(f"--topic chooses from a recording; {target} is a topic itself")
@@ -300,10 +296,7 @@ class Rate:
 def measure(arrivals: Iterator[float], window_s: float, count: int | None = None) -> Iterator[Rate]:
     """The rate over the last ``window_s`` seconds, once a second while something arrives, and at the end.
 
-    Args:
-        arrivals: times of arrival in seconds, rising, given as they come.
-        window_s: seconds to look back.
-        count: arrivals after which to end.
+    ``arrivals`` are rising times in seconds, given as they come; ``count`` is their number after which to end.
     """
     recent: deque[float] = deque()
     reported_at = None

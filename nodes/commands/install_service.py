@@ -9,8 +9,10 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -102,10 +104,6 @@ class Service:
     groups: tuple[str, ...]
     """besides the user's own, of those that this machine has"""
 
-    @property
-    def state(self) -> Path:
-        return Path("/var/lib", self.name)
-
     def unit(self) -> str:
         """The text of the unit."""
         return UNIT.format(
@@ -121,9 +119,7 @@ class Service:
     def check(self, launch: Launch, *python: Path) -> None:
         """Find what a service could not read, or write, before it fails at every boot.
 
-        Args:
-            launch: as it is read from ``launch``.
-            python: folders that the command needs besides its own.
+        ``launch`` is the launch file as it is read; ``python`` are folders that the command needs besides its own.
 
         Raises:
             LaunchError: names it, and what to do.
@@ -143,9 +139,10 @@ class Service:
                 f"/etc/{self.name}"
             )
         recording = launch.settings(RecorderSettings).directory if "recorder" in launch.nodes else ""
-        if recording and not _is_in(Path(recording), (str(self.state),)):
+        state = _state(self.name)
+        if recording and not _is_in(Path(recording), (str(state),)):
             raise LaunchError(
-                f"[recorder] directory is {recording}: expected one in {self.state}, for a service writes nowhere else"
+                f"[recorder] directory is {recording}: expected one in {state}, for a service writes nowhere else"
             )
         if launch.transport.directory and not _is_in(Path(launch.transport.directory), (f"/run/{self.name}",)):
             raise LaunchError(
@@ -168,30 +165,12 @@ BOOTED = Path("/run/systemd/system")
 """there where systemd runs this machine (sd_booted(3))"""
 
 
-@dataclass(frozen=True)
-class Step:
-    """One thing that is done: a command, or a file that is written."""
+Step = tuple[str, Callable[[], object]]
+"""One thing that is done: how it is printed, and a function that does it."""
 
-    command: tuple[str, ...] = ()
-    file: Path | None = None
-    text: str = ""
 
-    def __str__(self) -> str:
-        return f"write {self.file}" if self.file else shlex.join(self.command)
-
-    def do(self) -> None:
-        """Raises:
-        LaunchError: it failed.
-        """
-        try:
-            if self.file:
-                self.file.write_text(self.text, encoding="utf-8")
-            else:
-                subprocess.run(self.command, check=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            raise LaunchError(
-                f"`{self}` failed ({error}); what was done before stays: --uninstall undoes it"
-            ) from error
+def _command(*words: str) -> Step:
+    return shlex.join(words), partial(subprocess.run, words, check=True)
 
 
 def install_service(
@@ -228,10 +207,15 @@ def install_service(
     if not (uninstall or dry_run):
         # as root, so that all users find them beside the package
         compile_missing(lambda line: console.print(line, markup=False))
-    for step in steps:
-        console.print(f"+ {step}", markup=False)
-        if not dry_run:
-            step.do()
+    for said, act in steps:
+        console.print(f"+ {said}", markup=False)
+        try:
+            if not dry_run:
+                act()
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise LaunchError(
+                f"`{said}` failed ({error}); what was done before stays: --uninstall undoes it"
+            ) from error
     if uninstall and _state(name).exists():
         console.print(f"{_state(name)} is kept: remove it, and user {name}, if you do not need its recordings")
     elif not (uninstall or dry_run or BOOTED.exists()):
@@ -265,15 +249,16 @@ def _service(launch: str, name: str, user: str) -> Service:
 
 
 def _install(service: Service) -> Iterator[Step]:
+    unit = _unit(service.name)
     if service.is_new_user and not _has_user(service.user):
-        home = ("--home-dir", str(service.state), "--no-create-home", "--shell", "/usr/sbin/nologin")
-        yield Step(("useradd", "--system", "--user-group", *home, service.user))
-    yield Step(file=_unit(service.name), text=service.unit())
+        home = ("--home-dir", str(_state(service.name)), "--no-create-home", "--shell", "/usr/sbin/nologin")
+        yield _command("useradd", "--system", "--user-group", *home, service.user)
+    yield f"write {unit}", partial(unit.write_text, service.unit(), encoding="utf-8")
     if BOOTED.exists():
-        yield Step(("systemctl", "daemon-reload"))
-    yield Step(("systemctl", "enable", _unit(service.name).name))
+        yield _command("systemctl", "daemon-reload")
+    yield _command("systemctl", "enable", unit.name)
     if BOOTED.exists():  # also where an older unit runs
-        yield Step(("systemctl", "restart", "--no-block", _unit(service.name).name))
+        yield _command("systemctl", "restart", "--no-block", unit.name)
 
 
 def _undo(name: str) -> Iterator[Step]:
@@ -286,16 +271,16 @@ def _undo(name: str) -> Iterator[Step]:
     text = unit.read_text(encoding="utf-8", errors="replace")
     if MARK not in text:
         raise LaunchError(f"{unit} was not made by this command: expected one that begins with {MARK!r}")
-    stop = ("systemctl", "disable", *(["--now"] if BOOTED.exists() else []), unit.name)
-    yield Step(stop)
-    yield Step(("rm", "-f", str(unit)))
+    empty = not (state := _state(name)).exists() or not any(state.iterdir())
+    yield _command("systemctl", "disable", *(["--now"] if BOOTED.exists() else []), unit.name)
+    yield _command("rm", "-f", str(unit))
     if BOOTED.exists():
-        yield Step(("systemctl", "daemon-reload"))
-    yield Step(("rm", "-rf", f"/var/cache/{name}"))
-    if (state := _state(name)).exists() and not any(state.iterdir()):
-        yield Step(("rmdir", str(state)))
-    if f"\nUser={name}\n" in text and _has_user(name) and (not state.exists() or not any(state.iterdir())):
-        yield Step(("userdel", name))
+        yield _command("systemctl", "daemon-reload")
+    yield _command("rm", "-rf", f"/var/cache/{name}")
+    if empty and state.exists():
+        yield _command("rmdir", str(state))
+    if empty and f"\nUser={name}\n" in text and _has_user(name):
+        yield _command("userdel", name)
 
 
 def _unit(name: str) -> Path:
@@ -307,8 +292,6 @@ def _state(name: str) -> Path:
 
 
 def _has_user(name: str) -> bool:
-    try:
-        pwd.getpwnam(name)
-    except KeyError:
-        return False
-    return True
+    with suppress(KeyError):
+        return bool(pwd.getpwnam(name))
+    return False

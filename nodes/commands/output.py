@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -69,8 +69,7 @@ def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bo
     check_output(source, out)
     if out.suffix not in endings:
         raise LaunchError(f"{out}: expected a name ending in {', '.join(endings)}, got {out.suffix or 'none'}")
-    if os.path.lexists(out) and not (replace and out.is_file()):
-        raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
+    check_replaceable(out, replace=replace, is_file=True)
 
 
 def check_poses_file(source: Path, out: Path, *others: Path, replace: bool) -> None:
@@ -79,10 +78,10 @@ def check_poses_file(source: Path, out: Path, *others: Path, replace: bool) -> N
     """
     check_format(out)
     check_output(source, out, *others)
-    check_replaceable(out, replace=replace)
+    check_replaceable(out, replace=replace, is_file=out.suffix in ARRAY_FILES)
 
 
-def check_replaceable(out: Path, *, replace: bool) -> None:
+def check_replaceable(out: Path, *, replace: bool, is_file: bool) -> None:
     """Raises:
     LaunchError: something is there that is not to be replaced, or is nothing that these commands make.
     """
@@ -90,14 +89,13 @@ def check_replaceable(out: Path, *, replace: bool) -> None:
         return
     if not replace:
         raise LaunchError(f"{out} exists: expected a new path, or --force to replace it")
-    if out.suffix in ARRAY_FILES:
-        if not out.is_file():
-            raise LaunchError(f"{out} is no file: expected an {out.suffix} to replace")
-        return
-    try:
-        recorded_parts(out)
-    except (RecordingError, OSError) as error:
-        raise LaunchError(f"{out} is no recording, and is not replaced: {error}") from error
+    if is_file and not out.is_file():
+        raise LaunchError(f"{out} is no file: expected an {out.suffix} to replace")
+    if not is_file:
+        try:
+            recorded_parts(out)
+        except (RecordingError, OSError) as error:
+            raise LaunchError(f"{out} is no recording, and is not replaced: {error}") from error
 
 
 @contextmanager
@@ -120,40 +118,26 @@ def unfinished(out: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def write_recording(path: Path, messages: Iterable[tuple[str, Message]]) -> None:
-    """Write messages in this order, logged as the recorder logs them."""
-    log_times = LogTimes()
-    with RecordingWriter(path) as writer:
-        for topic, message in messages:
-            writer.write(topic, message, log_times.next(topic, message.stamp_ns))
-
-
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write the arrays of `NpzCollector` as the file's ending says: one of `ARRAY_FILES`."""
-    if path.suffix == ".csv":
-        write_csv(path, arrays)
-    else:
-        named: dict[str, Any] = dict(arrays)
-        np.savez(path, **named)
-
-
 def write_output(
     out: Path, arrays: Callable[[], Mapping[str, NDArray[Any]]], messages: Callable[[], Iterable[tuple[str, Message]]]
 ) -> None:
-    """Write arrays or messages, as the name's ending says; the output is there whole, or not at all."""
+    """Write arrays or messages, as the name's ending says; the output is there whole, or not at all.
+
+    Messages are logged as the recorder logs them. A recording that is there is replaced.
+    """
     with unfinished(out) as part:
-        if out.suffix in ARRAY_FILES:
-            write_arrays(part, arrays())
+        if out.suffix == ".csv":
+            write_csv(part, arrays())
+        elif out.suffix == ".npz":
+            np.savez(part, **arrays())  # type: ignore[arg-type]
         else:
-            write_recording(part, messages())
-        put_in_place(part, out)
-
-
-def put_in_place(part: Path, out: Path) -> None:
-    """Move what was written to ``part``, in the same file system, to ``out``; a recording there is replaced."""
-    if out.suffix not in ARRAY_FILES and out.exists():
-        shutil.rmtree(out)
-    part.replace(out)
+            log_times = LogTimes()
+            with RecordingWriter(part) as writer:
+                for topic, message in messages():
+                    writer.write(topic, message, log_times.next(topic, message.stamp_ns))
+            if out.exists():
+                shutil.rmtree(out)
+        part.replace(out)
 
 
 def console() -> Console:
@@ -218,33 +202,25 @@ def clean_recording(
     """
     from steadypose.nodes.driving import OfflineRun  # 95 MB of numba: not for commands that only print
 
-    to_file = out.suffix in ARRAY_FILES
-    check_replaceable(out, replace=replace)
+    check_replaceable(out, replace=replace, is_file=out.suffix in ARRAY_FILES)
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source, settings.get("rig", {}))
     run = OfflineRun(frames, settings)
     began(len(frames))
-    collector = NpzCollector()
-    log_times = LogTimes()
     started = time.perf_counter()
-    with unfinished(out) as part:
-        with nullcontext() if to_file else RecordingWriter(part) as writer:
-            for topic, message in run:
-                if writer:
-                    writer.write(topic, message, log_times.next(topic, message.stamp_ns))
-                else:
-                    collector.add(message)
-                if isinstance(message, PoseRaw) and not message.end_of_stream:
-                    advanced()
-        stamps_ns = run.stamps_ns
-        if not len(stamps_ns):
+
+    def messages() -> Iterator[tuple[str, Message]]:
+        for topic, message in run:
+            yield topic, message
+            if isinstance(message, PoseRaw) and not message.end_of_stream:
+                advanced()
+        if not len(run.stamps_ns):
             raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
-        if to_file:
-            write_arrays(part, collector.arrays(stamps_ns))
-        put_in_place(part, out)
+
+    write_output(out, lambda: NpzCollector(messages()).arrays(run.stamps_ns), messages)
     return Cleaned(
-        frames=len(stamps_ns),
-        duration_s=float(np.ptp(stamps_ns)) / 1e9,
+        frames=len(run.stamps_ns),
+        duration_s=float(np.ptp(run.stamps_ns)) / 1e9,
         spent_s=time.perf_counter() - started,
         poses=run.poses,
         refused=dict(run.refused),

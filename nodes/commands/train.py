@@ -103,11 +103,7 @@ def _weight_sets(model: str) -> tuple[str, ...]:
 
 
 def little_data(path: Path, weights: str) -> str:
-    """What to say of prepared motion that is little; empty if it is enough, or no prepared motion.
-
-    Args:
-        path: what `steadypose prepare` wrote, or what a model is trained on instead.
-        weights: ``default`` trains on the clips free for products, ``research`` on all.
+    """What to say of prepared motion that is too little for a set of weights; empty if it is enough, or another file.
 
     Raises:
         LaunchError: it is too little to begin with.

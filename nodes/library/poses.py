@@ -288,20 +288,14 @@ def sample(name: str = BUNDLED) -> Sample:
             joints = to_world(body.positions, raw.sensor_pose)
             positions[row, ids.index(body.id)] = to_canonical(SKELETONS[raw.skeleton], joints, body.confidence)[0]
     stamps = np.array([raw.stamp_ns for raw in raws], np.int64)
-    truth = _at(truths, stamps)
-    alone = len(ids) == truth.shape[1] == 1
-    return Sample(positions[:, 0], stamps, truth[:, 0]) if alone else Sample(positions, stamps, truth)
-
-
-def _at(truths: list[PoseWorld], stamps: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(T, B, 22, 3) metres, world, at stamps (T,): between the truth's own, where it is on both sides."""
-    times = np.array([message.stamp_ns for message in truths])
     people = sorted({body.id for message in truths for body in message.bodies})
     places = np.full((len(truths), len(people), 22, 3), np.nan)
     for row, message in enumerate(truths):
         for body in message.bodies:
             places[row, people.index(body.id)] = body.positions
-    after = np.searchsorted(times, stamps).clip(1, len(times) - 1)
-    share = ((stamps - times[after - 1]) / (times[after] - times[after - 1]))[:, None, None, None]
-    share = np.where((share >= 0.0) & (share <= 1.0), share, np.nan)
-    return (1.0 - share) * places[after - 1] + share * places[after]
+    from scipy.interpolate import interp1d  # imported late: it takes a tenth of a second
+
+    times = np.array([message.stamp_ns for message in truths])
+    truth = interp1d(times - times[0], places, axis=0, bounds_error=False)(stamps - times[0])
+    alone = len(ids) == len(people) == 1
+    return Sample(positions[:, 0], stamps, truth[:, 0]) if alone else Sample(positions, stamps, truth)
