@@ -21,7 +21,7 @@ from steadypose.msgs.codec import (
     wire_type,
 )
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD, TOPICS
-from steadypose.msgs.types import Diagnostics, Message, Pose, PoseEvents
+from steadypose.msgs.types import Diagnostics, Message, PoseEvents
 
 PAYLOADS = {topic: encode(message) for topic, message in EXAMPLES.items()}
 TOPIC_NAMES = st.sampled_from(list(TOPICS))
@@ -176,15 +176,6 @@ ORIENTATION = np.array([0.1, -0.2, 0.3, 0.9])
 """x, y, z, w: no two alike, so that no order is another's."""
 
 
-def test_a_quaternion_goes_over_the_wire_as_x_y_z_w():
-    sent = raw()
-    sent.sensor_pose = Pose(np.array([1.0, 2.0, 3.0]), ORIENTATION)
-    payload = encode(sent)
-    pose = struct.pack("<7d", 1.0, 2.0, 3.0, 0.1, -0.2, 0.3, 0.9)
-    assert payload.count(pose) == 1
-    assert decode(POSE_RAW, payload).sensor_pose.orientation.tolist() == ORIENTATION.tolist()  # type: ignore[union-attr]
-
-
 @pytest.mark.parametrize("topic", [POSE_RAW, POSE_CLEAN, POSE_WORLD])
 def test_a_quaternion_of_ros_has_its_names_in_our_order(topic: str):
     """What another node writes by the names x, y, z and w is read in that order, and the reverse."""
@@ -196,7 +187,4 @@ def test_a_quaternion_of_ros_has_its_names_in_our_order(topic: str):
     message = decode(topic, bytes(store.serialize_cdr(wire, name)))
     read = message.bodies[0].root_orientation if topic == POSE_WORLD else message.sensor_pose.orientation  # type: ignore[union-attr]
     assert read.tolist() == ORIENTATION.tolist()
-    wire = store.deserialize_cdr(encode(message), name)
-    pose = wire.bodies[0].root_pose if topic == POSE_WORLD else wire.sensor_pose  # type: ignore[attr-defined]
-    written = pose.orientation
-    assert [written.x, written.y, written.z, written.w] == ORIENTATION.tolist()
+    assert encode(message) == bytes(store.serialize_cdr(wire, name))

@@ -15,7 +15,7 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw
 from steadypose.nodes.commands.plot import plot
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.plot.history import PlotError, errors_of, read_history
+from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path
 from steadypose.nodes.sinks.plot.panels import busiest_joints
 from steadypose.prior.body.skeleton import J
 
@@ -86,7 +86,7 @@ def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
             writer.write(topic, message, message.stamp_ns)
         values = {"dropped.late": "3", "queue": "1", "refused.undecodable": "2"}
         writer.write(DIAGNOSTICS, Diagnostics(3 * 10**9, "prior", Level.WARN, "", values), 3 * 10**9)
-    history = read_history(tmp_path / "bag")
+    history = history_of_path(tmp_path / "bag")
     assert history.dropped_or_refused == {"prior dropped.late": 3, "prior refused.undecodable": 2}
     assert set(history.tracks[POSE_CLEAN]) == {0, 1}
     for body in (0, 1):
@@ -102,7 +102,7 @@ def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> 
         for body in message.bodies if isinstance(message, PoseRaw) else ():
             body.id = 7 - body.id
 
-    history = read_history(record(tmp_path / "bag", 1.0, change=renumber, bodies=2))
+    history = history_of_path(record(tmp_path / "bag", 1.0, change=renumber, bodies=2))
     assert errors_of(history, 7)[POSE_RAW].mean.max() < 0.1
 
 
@@ -112,7 +112,7 @@ def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) ->
             turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(message.sensor_pose.orientation)
             message.calibrated, message.sensor_pose = False, Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
 
-    errors = errors_of(read_history(record(tmp_path / "bag", 3.0, change=misplace)), 0)
+    errors = errors_of(history_of_path(record(tmp_path / "bag", 3.0, change=misplace)), 0)
     assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
 
 
@@ -120,12 +120,12 @@ def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
     def silence(topic: str, message: Message) -> object:
         return GONE if topic == POSE_TRUTH and 2e9 < message.stamp_ns < 3e9 else None
 
-    times = errors_of(read_history(record(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
+    times = errors_of(history_of_path(record(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
     assert not ((times > 1.1) & (times < 1.9)).any()
 
 
 def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
-    history = read_history(record(tmp_path / "bag", 4.0, {POSE_CLEAN}))
+    history = history_of_path(record(tmp_path / "bag", 4.0, {POSE_CLEAN}))
     track = history.track(POSE_CLEAN, 0)
     assert track is not None
     assert busiest_joints(track)[0] == J["left_wrist"]

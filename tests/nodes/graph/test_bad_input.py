@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zmq
 from conftest import raw, record, running, until, walking
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
@@ -180,24 +179,6 @@ def test_no_node_goes_down(make_launch: Callable[..., Launch]) -> None:
     assert not [cause for cause in (prior.health.counts | trajectory.health.counts) if cause.endswith("Error")], (
         "no surprises"
     )
-
-
-def test_bytes_that_are_not_even_zeromq(make_launch: Callable[..., Launch]) -> None:
-    """Somebody else's client on the port."""
-    with Publisher("tcp://127.0.0.1:*") as source:
-        port = source.endpoint.rpartition(":")[2]
-        context = zmq.Context()
-        stranger = context.socket(zmq.STREAM)
-        stranger.setsockopt(zmq.LINGER, 0)
-        stranger.connect(f"tcp://127.0.0.1:{port}")
-        identity, _ = stranger.recv_multipart()
-        stranger.send_multipart([identity, b"GET / HTTP/1.1\r\n\r\n" * 100])
-        with Subscriber(source.endpoint, [POSE_RAW], name="friend") as friend:
-            assert source.wait_for_subscribers({"friend"}, timeout_s=10)
-            source.publish(POSE_RAW, raw(0, walking(0)))
-            assert friend.receive(10) == (POSE_RAW, raw(0, walking(0)))
-        stranger.close()
-        context.term()
 
 
 def test_clean_counts_and_goes_on(tmp_path: Path, capsys) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 from conftest import repeated, running, until
-from tests.helpers.foxglove_client import FoxgloveClient
+from tests.helpers.foxglove_client import first_message
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.topics import POSE_WORLD
@@ -24,16 +24,10 @@ def test_a_client_gets_markers(make_launch: Callable[..., Launch]) -> None:
     node = FoxgloveNode(launch)
     with Publisher(launch.transport.endpoint("trajectory")) as publisher, running(node):
         until(lambda: bool(node.url))
-
         with repeated(lambda: publisher.publish(POSE_WORLD, worlds[-1])):
-            client = FoxgloveClient(int(node.url.rpartition(":")[2]))
-            try:
-                channel = client.channels("/steadypose/markers")["/steadypose/markers"]
-                assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
-                assert "Marker[] markers" in channel["schema"]
-                got = client.first(channel)
-            finally:
-                client.close()
+            channel, got = first_message(int(node.url.rpartition(":")[2]), "/steadypose/markers")
+    assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
+    assert "Marker[] markers" in channel["schema"]
     message = deserialise(got, "visualization_msgs/msg/MarkerArray")
     assert {mark.ns.partition("/")[2] for mark in message.markers} == {"joints", "bones", "velocity", "name"}
 
@@ -42,13 +36,9 @@ def test_who_subscribes_late_gets_what_is_latched() -> None:
     output = FoxgloveOutput(0)
     try:
         for text in ("at first", "at last"):
-            cdr = serialise(new("std_msgs/msg/String", data=text), "std_msgs/msg/String")
+            cdr = serialise(new("std_msgs/msg/String", data=text))
             output.send("humans/bodies/b1/urdf", "std_msgs/msg/String", cdr, latched=True)
-        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
-        try:
-            got = client.first(client.channels("/humans/bodies/b1/urdf")["/humans/bodies/b1/urdf"])
-            assert deserialise(got, "std_msgs/msg/String").data == "at last"
-        finally:
-            client.close()
+        _, got = first_message(int(output.url.rpartition(":")[2]), "/humans/bodies/b1/urdf")
+        assert deserialise(got, "std_msgs/msg/String").data == "at last"
     finally:
         output.close()

@@ -339,4 +339,4 @@ def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> 
 def deserialise_text(text: str) -> bytes:
     from steadypose.nodes.ros2.definitions import new, serialise
 
-    return serialise(new("std_msgs/msg/String", data=text), "std_msgs/msg/String")
+    return serialise(new("std_msgs/msg/String", data=text))

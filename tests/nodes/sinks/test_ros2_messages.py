@@ -26,7 +26,7 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import JointState, Message, Tracking
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.ros2.definitions import deserialise, ros_types, type_hash
+from steadypose.nodes.ros2.definitions import deserialise, ros_types
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode
 
 ROOT = Path(__file__).parents[3]
@@ -134,7 +134,7 @@ def stream() -> dict[str, list[Message]]:
 def test_ros_gives_each_type_the_hash_that_we_announce(kind: str) -> None:
     described = json.loads((SHARED / f"{kind}.json").read_text())
     hashes = {it["type_name"]: it["hash_string"] for it in described["type_hashes"]}
-    assert hashes[f"steadypose_msgs/msg/{kind}"] == type_hash(f"steadypose_msgs/msg/{kind}")
+    assert hashes[f"steadypose_msgs/msg/{kind}"] == ros_types().hash_rihs01(f"steadypose_msgs/msg/{kind}")
 
 
 def test_a_ros_node_receives_whole_messages_from_the_bridge(

@@ -14,7 +14,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,18 @@ import numpy as np
 import pytest
 from tests.helpers.synthetic_poses import CAMERA, messages, walker
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseClean, PoseRaw, RawBody, Tracking
+from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseRaw, RawBody, Tracking
 from steadypose.nodes import extras
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer import scene
-from steadypose.nodes.sinks.viewer import server as drawings
 from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
-from steadypose.nodes.sinks.viewer.node import ViewerNode, ViewerSettings
+from steadypose.nodes.sinks.viewer.node import ViewerNode
 from steadypose.nodes.sinks.viewer.scene import PoseView
 from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
 from steadypose.nodes.sources.image import CameraImage
@@ -89,13 +88,19 @@ def colours(archetype: Any) -> set[str]:
     return {f"#{int(colour) >> 8:06x}" for colour in archetype.colors.as_arrow_array().to_pylist()}
 
 
-def only(stream, *topics: str):
-    return [(topic, message) for topic, message in stream if topic in topics]
+def only(stream: Iterable[tuple[str, Message]], *topics: str) -> list[Any]:
+    return [message for topic, message in stream if topic in topics]
+
+
+def draw(view: PoseView, seconds: float, *topics: str) -> None:
+    """A walker, as these topics tell of him."""
+    for topic, message in messages(seconds):
+        if topic in topics:
+            view.log(topic, message)
 
 
 def test_raw_and_clean_stand_upright_at_the_same_place(view: PoseView, log: Log) -> None:
-    for topic, message in messages(0.5):
-        view.log(topic, message)
+    draw(view, 0.5, POSE_RAW, POSE_CLEAN)
     positions, _, _ = walker(10 / 30)
     raw = points(log.last("raw/made-up/0/joints"))
     clean = points(log.last("clean/made-up/0/joints"))
@@ -105,8 +110,7 @@ def test_raw_and_clean_stand_upright_at_the_same_place(view: PoseView, log: Log)
 
 
 def test_bones_have_the_colours_of_their_sides_and_are_faint_where_not_observed(view: PoseView, log: Log) -> None:
-    (_, message), *_ = only(messages(0.5), POSE_CLEAN)
-    assert isinstance(message, PoseClean)
+    message = only(messages(0.5), POSE_CLEAN)[0]
     for state, sides in ((JointState.REFINED, SIDE_RGB), (JointState.IMPUTED, FAINT_RGB)):
         message.bodies[0].state[:] = state
         view.log(POSE_CLEAN, message)
@@ -115,18 +119,16 @@ def test_bones_have_the_colours_of_their_sides_and_are_faint_where_not_observed(
 
 
 def test_missing_joints_are_not_drawn(view: PoseView, log: Log) -> None:
-    (_, message), *_ = only(messages(0.1), POSE_RAW)
-    assert isinstance(message, PoseRaw)
+    message = only(messages(0.1), POSE_RAW)[0]
     message.bodies[0].positions[3:] = np.nan
     view.log(POSE_RAW, message)
     assert len(points(log.last("raw/made-up/0/joints"))) == 3
 
 
 def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
-    for topic, message in only(messages(0.5, bodies=2), POSE_WORLD):
-        view.log(topic, message)
-    leaving = [m for _, m in only(messages(0.6, bodies=2), POSE_WORLD)][-1]
-    leaving.bodies.pop()  # type: ignore[union-attr]
+    both, leaving = only(messages(0.3, bodies=2), POSE_WORLD)[-2:]
+    view.log(POSE_WORLD, both)
+    leaving.bodies.pop()
     view.log(POSE_WORLD, leaving)
     assert isinstance(log.last("world/made-up/1"), rr.Clear)
 
@@ -134,26 +136,22 @@ def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
 def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene, "PATH_SECONDS", 2.0)
     stream = only(messages(3.0), POSE_WORLD)
-    stream[-1][1].bodies[0].tracking = Tracking.COASTING  # type: ignore[union-attr]
-    for topic, message in stream:
-        view.log(topic, message)
+    stream[-1].bodies[0].tracking = Tracking.COASTING
+    for message in stream:
+        view.log(POSE_WORLD, message)
     assert log.last("world/made-up/0/label").labels.as_arrow_array().to_pylist() == ["0 · coasting"]
     way = log.last("world/made-up/0/path").strips.as_arrow_array().to_pylist()[0]
     assert len(way) == pytest.approx(2.0 * 30, abs=2)
 
 
-def test_truth_is_drawn_thin_and_draws_no_rate(view: PoseView, log: Log) -> None:
-    for topic, message in only(messages(0.2), POSE_TRUTH):
-        view.log(topic, message)
-    assert {path for _, path, _ in log.drawn} == {"world/truth/made-up/0/bones"}
-
-
-def test_truth_is_left_out_where_the_cameras_place_is_unknown(view: PoseView, log: Log) -> None:
-    for topic, message in only(messages(0.2), POSE_RAW, POSE_TRUTH):
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_truth_is_drawn_thin_where_the_cameras_place_is_known(view: PoseView, log: Log, calibrated: bool) -> None:
+    for topic, message in messages(0.1):
         if isinstance(message, PoseRaw):
-            message.calibrated = False
+            message.calibrated = calibrated
         view.log(topic, message)
-    assert not log.times("world/truth/made-up/0/bones")
+    paths = {path for _, path, _ in log.drawn if path.startswith("world/truth")}
+    assert paths == ({"world/truth/made-up/0/bones"} if calibrated else set())
     assert log.times("raw/made-up/0/bones")
 
 
@@ -161,31 +159,27 @@ def test_rates_are_the_nodes_own(view: PoseView, log: Log) -> None:
     report = Diagnostics(0, "prior", Level.OK, "", {"rate.pose/clean": "29.97", "queue": "0"})
     view.log(DIAGNOSTICS, report)
     assert not log.drawn, "before the first pose there is no time to draw a rate at"
-    for topic, message in only(messages(0.5), POSE_CLEAN):
-        view.log(topic, message)
+    draw(view, 0.5, POSE_CLEAN)
     view.log(DIAGNOSTICS, report)
     assert log.last("plots/rates/pose/clean").scalars.as_arrow_array().to_pylist() == [29.97]
     assert log.times("plots/rates/pose/clean") == [pytest.approx(0.3333, abs=0.04)]
 
 
 def test_anomaly_is_drawn_once_there_is_a_score(view: PoseView, log: Log) -> None:
-    stream = only(messages(1.0), POSE_CLEAN)
-    for _, message in stream[:5]:
-        message.bodies[0].anomaly = np.nan  # type: ignore[union-attr]
-    for topic, message in stream[:5]:
-        view.log(topic, message)
+    unscored, *stream = only(messages(1.0), POSE_CLEAN)
+    unscored.bodies[0].anomaly = np.nan
+    view.log(POSE_CLEAN, unscored)
     blueprints = log.blueprints
     assert not log.times("plots/anomaly/made-up/0")
-    for topic, message in stream[5:]:
-        view.log(topic, message)
-    assert len(log.times("plots/anomaly/made-up/0")) == len(stream) - 5
+    for message in stream:
+        view.log(POSE_CLEAN, message)
+    assert len(log.times("plots/anomaly/made-up/0")) == len(stream)
     assert log.blueprints == blueprints + 1
 
 
 def test_time_goes_on_when_stamps_jump_back(view: PoseView, log: Log) -> None:
     for _ in range(2):
-        for topic, message in only(messages(3.0), POSE_CLEAN):
-            view.log(topic, message)
+        draw(view, 3.0, POSE_CLEAN)
     times = log.times("clean/made-up/0/bones")
     assert np.all(np.diff(times) >= 0)
     assert times[-1] == pytest.approx(2 * 2.83, abs=0.1)
@@ -193,9 +187,9 @@ def test_time_goes_on_when_stamps_jump_back(view: PoseView, log: Log) -> None:
 
 def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: Log) -> None:
     stream = only(messages(4.0), POSE_RAW)
-    stream[60][1].bodies[0].positions[:] = 1e4  # type: ignore[union-attr]
-    for topic, message in stream:
-        view.log(topic, message)
+    stream[60].bodies[0].positions[:] = 1e4
+    for message in stream:
+        view.log(POSE_RAW, message)
     positions, _, _ = walker(4.0)
     assert points(log.last("raw/focus"))[0][:2] == pytest.approx(positions[0, :2], abs=0.5)
 
@@ -209,10 +203,10 @@ def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: 
     ],
 )
 def test_what_cannot_be_drawn_says_why(view: PoseView, spoil, expected: str) -> None:
-    (topic, message), *_ = only(messages(0.1), POSE_RAW)
+    message = only(messages(0.1), POSE_RAW)[0]
     spoil(message)
     with pytest.raises(ValueError, match=expected):
-        view.log(topic, message)
+        view.log(POSE_RAW, message)
 
 
 def test_nothing_seen_and_nonsense_are_drawn_without_complaint(view: PoseView) -> None:
@@ -233,13 +227,11 @@ def server() -> Iterator[ViewerServer]:
         yield server
 
 
-def test_the_server_shows_a_page_on_this_machine_alone() -> None:
+def test_the_server_listens_on_this_machine_alone_and_at_a_port_that_is_free() -> None:
     port = free_port()
     with ViewerServer(port):
-        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
-            address, state = line.split()[1], line.split()[3]
-            if state == "0A" and int(address.split(":")[1], 16) == port:
-                assert address.startswith("0100007F"), "listens beyond 127.0.0.1"
+        listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line]
+        assert [at.partition(":")[0] for at in listening if int(at.partition(":")[2], 16) == port] == ["0100007F"]
         with pytest.raises(ViewerError, match=f"port {port} at 127.0.0.1 is not to be had"):
             ViewerServer(port)
     ViewerServer(port).close()
@@ -296,8 +288,8 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(
     thread = threading.Thread(target=run, daemon=True)
     with Publisher(launch.transport.endpoint("prior")) as publisher:
         thread.start()
-        for topic, message in only(itertools.islice(itertools.cycle(messages(1.0)), 20_000), POSE_CLEAN):
-            publisher.publish(topic, message)
+        for message in itertools.islice(itertools.cycle(only(messages(1.0), POSE_CLEAN)), 5_000):
+            publisher.publish(POSE_CLEAN, message)
             thread.join(0.005)
             if any(path.startswith("clean/") for _, path, _ in log.drawn):
                 break
@@ -354,8 +346,8 @@ def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) ->
 
 
 def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawings, "FIRST", 2)
-    monkeypatch.setattr(drawings, "MOST_BYTES", 3)
+    monkeypatch.setattr(viewer_server, "FIRST", 2)
+    monkeypatch.setattr(viewer_server, "MOST_BYTES", 3)
     kept = Drawings()
     early = kept.follow()
     for number in range(3):
@@ -372,14 +364,8 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypat
     assert list(late) == []
 
 
-def test_a_host_that_is_none() -> None:
-    with pytest.raises(LaunchError, match="host: expected an address"):
-        ViewerSettings(host="")
-
-
-def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(log: Log) -> None:
-    view = PoseView(log)  # type: ignore[arg-type]
-    cleaned = [message for topic, message in messages(1.0) if topic == POSE_CLEAN]
+def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(view: PoseView, log: Log) -> None:
+    cleaned = only(messages(0.5), POSE_CLEAN)
     layouts = log.blueprints
     view.keep(CameraImage(cleaned[1].stamp_ns, (480, 360), np.eye(3), b"a jpeg"))
     view.log(POSE_CLEAN, cleaned[0])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import START_NS, VirtualClock, raw, record, walk, walking
 
+from steadypose.msgs.delivery import Deliveries
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Message, PoseRaw, PoseWorld
@@ -47,6 +48,7 @@ class Sent:
 
     def __init__(self, clock: VirtualClock) -> None:
         self.refused: Counter[str] = Counter()
+        self.deliveries = Deliveries((), {})
         self._clock = clock
         self.at: list[tuple[int, Message]] = []
 
@@ -54,9 +56,6 @@ class Sent:
         if topic != DIAGNOSTICS:
             self.at.append((self._clock.time_ns, message))
         return True
-
-    def silent(self, for_s: float) -> frozenset[str]:
-        return frozenset()
 
     def check(self) -> None: ...
 

@@ -95,7 +95,7 @@ class Robot(Connection):
 
     def spin(self, timeout_s: float) -> None:
         for topic, message in self.queue:
-            self.heard[topic](serialise(message, "tf2_msgs/msg/TFMessage"))
+            self.heard[topic](serialise(message))
         self.queue.clear()
 
     def close(self) -> None:

@@ -113,7 +113,7 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
         assert next(frames) is None
         assert camera.wait_for_subscribers({"merge"}, timeout_s=20)
         camera.publish(POSE_RAW, first)
-        camera._deliveries.sequence[POSE_RAW] += 3  # which nobody heard
+        camera.deliveries.sequence[POSE_RAW] += 3  # which nobody heard
         camera.publish(POSE_RAW, last)
         until(lambda: (next(frames), source._received.total())[1] == 2)
     assert source.status()["dropped.lost pose/raw"] == "3"

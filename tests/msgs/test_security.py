@@ -1,0 +1,118 @@
+"""Who may publish and subscribe: folders that others may write to say nothing, and a secret key is its owner's."""
+
+import os
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from steadypose.msgs.security import (
+    Keys,
+    TransportError,
+    create_keys,
+    load_keys,
+    local_address,
+    local_directory,
+    loopback_keys,
+    make_private,
+)
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.transport import Subscriber
+
+
+def test_a_directory_that_others_may_write_to_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    directory = local_directory()
+    assert directory == tmp_path / f"steadypose-{os.getuid()}"
+    make_private(directory)
+    assert directory.stat().st_mode & 0o777 == 0o700
+    local_address("prior")
+    directory.chmod(0o777)
+    for use in (
+        lambda: local_address("prior"),
+        lambda: make_private(directory),
+        lambda: Subscriber(f"ipc://{directory}/prior", POSE_RAW),
+    ):
+        with pytest.raises(TransportError, match="can be written to by others"):
+            use()
+    directory.rmdir()
+    directory.write_text("")
+    with pytest.raises(TransportError, match="expected a directory for sockets"):
+        local_address("prior")
+
+
+@pytest.mark.parametrize(
+    ("use", "said"),
+    [
+        (make_private, "expected a directory of one's own"),
+        (load_keys, "belongs to user .*: expected keys"),
+    ],
+)
+def test_a_directory_of_somebody_else_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], object], said: str
+):
+    create_keys(tmp_path)
+    mine = os.getuid()
+    if mine == 0:  # whose directories are trusted
+        os.chown(tmp_path, 1, -1)
+    else:
+        monkeypatch.setattr(os, "getuid", lambda: mine + 1)
+    with pytest.raises(ValueError, match=said):
+        use(tmp_path)
+
+
+def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
+    keys = create_keys(tmp_path / "keys")
+    secret_file = tmp_path / "keys" / "own.key_secret"
+    assert secret_file.stat().st_mode & 0o777 == 0o600
+    assert keys.secret.decode() in secret_file.read_text()
+    assert keys.secret.decode() not in repr(keys)
+    assert load_keys(tmp_path / "keys") == keys
+    assert keys == Keys(
+        keys.public, keys.secret, server=keys.public, clients=frozenset({keys.public}), directory=tmp_path / "keys"
+    )
+    with pytest.raises(ValueError, match="exists already"):
+        create_keys(tmp_path / "keys")
+    secret_file.chmod(0o640)
+    with pytest.raises(ValueError, match="chmod 600"):
+        load_keys(tmp_path / "keys")
+
+
+def test_keys_that_are_none_are_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="no such file; make keys with `steadypose keys"):
+        load_keys(tmp_path)
+    create_keys(tmp_path)
+    (tmp_path / "clients" / "short.key").write_text('curve\n    public-key = "short"\n')
+    with pytest.raises(ValueError, match="expected keys of 40 characters, got one of 5"):
+        load_keys(tmp_path)
+    (tmp_path / "own.key_secret").write_text((tmp_path / "own.key").read_text())
+    with pytest.raises(ValueError, match="expected a secret key, found none"):
+        load_keys(tmp_path)
+
+
+def test_two_processes_that_make_the_keys_at_once_have_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    made: list[Keys] = []
+    threads = [threading.Thread(target=lambda: made.append(loopback_keys())) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 8
+    assert len({keys.secret for keys in made}) == 1
+
+
+@pytest.mark.parametrize("part", [".", "clients", "servers"])
+@pytest.mark.parametrize("mode", [0o777, 0o702])
+def test_keys_in_a_folder_that_others_may_write_to_are_refused(tmp_path: Path, part: str, mode: int):
+    """They could let themselves in."""
+    keys = tmp_path / "keys"
+    create_keys(keys)
+    (keys / "servers").mkdir()
+    load_keys(keys)
+    (keys / part).chmod(mode)
+    with pytest.raises(ValueError, match=r"can be written to by others.*chmod go-w"):
+        load_keys(keys)
