@@ -112,14 +112,14 @@ class McapFile:
         self.complete = True
         self._lost: dict[int, int] = {}
         self._left = 0  # bytes that may still be decompressed in this pass over the file
+        begins = file.read(len(_MAGIC)) == _MAGIC
         try:
-            indexed = self._read_index()
+            indexed = begins and self._read_index()
         except BROKEN:
             indexed = False
         if not indexed:
             self._scan()
-        file.seek(0)
-        if file.read(len(_MAGIC)) != _MAGIC and not self.places:
+        if not begins and not self.places:
             raise ValueError("it does not begin as MCAP files do, and holds no chunk")
 
     @property
@@ -144,34 +144,29 @@ class McapFile:
         """The messages on ``topics`` (names as in the file) from ``start_ns`` on, by log time, then in file order."""
         self._left = self._budget
         wanted = {channel.id for channel in self.channels.values() if channel.topic in topics}
-        waiting: list[tuple[int, int, int, Channel, bytes | memoryview]] = []
+        waiting: list[tuple[int, int, int, Logged]] = []  # the offset and index make each one comparable
         for place in sorted(self.places, key=lambda place: (place.start_ns, place.offset)):
             if start_ns is not None and place.end_ns < start_ns:
                 continue
             while waiting and waiting[0][0] < place.start_ns:
-                log_ns, _, _, channel, data = heapq.heappop(waiting)
-                yield Logged(log_ns, channel, data)
+                yield heapq.heappop(waiting)[-1]
             try:
                 found = [
-                    (log_ns, place.offset, index, self.channels[channel], data)
+                    (log_ns, place.offset, index, Logged(log_ns, self.channels[channel], data))
                     for index, (channel, log_ns, data) in enumerate(self._messages_at(place))
                     if channel in wanted and (start_ns is None or log_ns >= start_ns)
                 ]
             except BROKEN:
-                self._lose(place.offset, place.length)
+                self._lost[place.offset] = place.length
                 continue
             for item in found:
                 heapq.heappush(waiting, item)
         while waiting:
-            log_ns, _, _, channel, data = heapq.heappop(waiting)
-            yield Logged(log_ns, channel, data)
+            yield heapq.heappop(waiting)[-1]
 
     @property
     def _budget(self) -> int:
         return max(FILE_RATIO_FROM, MAX_RATIO * self._size)
-
-    def _lose(self, offset: int, length: int) -> None:
-        self._lost[offset] = length
 
     def _messages_at(self, place: Place) -> Iterator[tuple[int, int, bytes | memoryview]]:
         """Channel id, log time and data of each message in a chunk."""
@@ -230,9 +225,6 @@ class McapFile:
             if zlib.crc32(summed) != checksum:
                 return False
         self._file.seek(0)
-        if self._file.read(len(_MAGIC)) != _MAGIC:
-            return False
-        self._file.seek(0)
         summary = SeekingReader(self._file, record_size_limit=self._size).get_summary()
         if summary is None or summary.statistics is None:
             return False
@@ -257,7 +249,7 @@ class McapFile:
                 at = self._take(at, found)
             except BROKEN:
                 after = self._next_chunk(at + 1)
-                self._lose(at, after - at)
+                self._lost[at] = after - at
                 at = after
         # messages outside chunks have no checksum: in a file with chunks, they are damage that looks like a message
         chunked = any(place.opcode == Opcode.CHUNK for place, _ in found)
@@ -328,14 +320,10 @@ def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
 
 
 def _decompressed(body: bytes, most: int) -> bytes | memoryview:
-    """The decompressed content of a chunk.
-
-    Args:
-        body: content of the chunk's record.
-        most: largest decompressed size besides `MAX_CHUNK`, bytes.
+    """The decompressed content of a chunk's record.
 
     Raises:
-        BROKEN: the checksum is wrong, or the content exceeds a limit.
+        BROKEN: the checksum is wrong, or the content exceeds ``most`` bytes or another limit.
     """
     _, _, size, checksum, name_length = _CHUNK.unpack_from(body)
     at = _CHUNK.size + name_length

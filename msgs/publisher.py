@@ -68,6 +68,7 @@ class Publisher(Closing):
 
     Attributes:
         endpoint: the bound address; a port given as `*` is replaced by its number.
+        deliveries: what its reliable subscribers have acknowledged.
         refused: number of connections closed by the publisher, by cause.
     """
 
@@ -106,7 +107,7 @@ class Publisher(Closing):
         self.refused: Counter[str] = Counter()
         self._keys = keys
         self._clients = ClientList(keys) if keys else None
-        self._deliveries = Deliveries(reliable, resume.sequence if resume else {})
+        self.deliveries = Deliveries(reliable, resume.sequence if resume else {})
         self._listeners: set[Listener] = set()
         self._subscriptions: set[bytes] = set()
         self._new_subscriptions: Counter[int] = Counter()
@@ -174,32 +175,20 @@ class Publisher(Closing):
         size = len(topic) + 1 + PREFIX.size + len(payload)
         if size > MAX_FRAME:
             raise ValueError(f"{topic}: expected a message of at most {MAX_FRAME} bytes, got {size}")
-        if not self._wait(lambda: not self._deliveries.waited_for(topic), timeout_s):
+        if not self._wait(lambda: not self.deliveries.waited_for(topic), timeout_s):
             return False
-        id, sequence = self._id_of(topic), self._deliveries.sequence[topic]
+        id, sequence = self._id_of(topic), self.deliveries.sequence[topic]
         frame = topic.encode() + b"\0" + PREFIX.pack(VERSION, id, sequence, time.monotonic_ns()) + payload
         self._socket.send(frame)
-        self._deliveries.sent(topic, frame)
+        self.deliveries.sent(topic, frame)
         return True
 
     def _id_of(self, topic: str) -> int:
         return self.id if topic in self._resumed else self._new_id
 
-    def sequence(self, topic: str) -> int:
-        """Sequence number of the next message of a topic."""
-        return self._deliveries.sequence[topic]
-
-    def waited_for(self, topic: str) -> frozenset[str]:
-        """Names of the reliable subscribers for which the topic's next message waits."""
-        return self._deliveries.waited_for(topic)
-
-    def silent(self, for_s: float) -> frozenset[str]:
-        """Names of the reliable subscribers that have had unread messages for longer than ``for_s`` seconds."""
-        return self._deliveries.silent(for_s)
-
     def is_taken(self, topic: str, sequence: int, timeout_s: float = 0.0) -> bool:
         """Whether all reliable subscribers of a topic acknowledge a message within ``timeout_s`` seconds."""
-        return self._wait(lambda: self._deliveries.is_taken(topic, sequence), timeout_s)
+        return self._wait(lambda: self.deliveries.is_taken(topic, sequence), timeout_s)
 
     @property
     def subscribers(self) -> frozenset[str]:
@@ -248,7 +237,7 @@ class Publisher(Closing):
         self.refused[cause] += 1
         self._socket.close(0)
         self._listeners.clear()
-        self._deliveries.leave_all()
+        self.deliveries.leave_all()
         self._subscriptions.clear()
         deadline = time.monotonic() + REBIND_S
         while True:
@@ -273,10 +262,10 @@ class Publisher(Closing):
                 self._subscriptions.discard(frame[1:])
                 if listener := read_subscription(frame[1:]):
                     self._listeners.discard(listener)
-                    self._deliveries.leave(listener)
+                    self.deliveries.leave(listener)
             elif taken := read_taken(frame, TOPICS):
                 if taken.publisher == self._id_of(taken.topic):
-                    self._deliveries.take(taken)
+                    self.deliveries.take(taken)
             else:
                 self._note_new(received)
 
@@ -285,7 +274,7 @@ class Publisher(Closing):
         self._note_new(received)
         if listener := read_subscription(prefix):
             self._listeners.add(listener)
-            for frame in self._deliveries.join(listener):
+            for frame in self.deliveries.join(listener):
                 self._socket.send(prefix + b"\0" + frame)
 
     def _note_new(self, received: zmq.Frame) -> None:

@@ -53,7 +53,10 @@ class RecordingReader(Closing):
         self._files = ExitStack()
         with ExitStack() as undo:
             undo.callback(self._files.close)
-            self._parts = [self._open(file) for file in self._find()]
+            files = [self.path] if self.path.is_file() else sorted(self.path.glob("*.mcap"), key=_in_order)
+            if not files:
+                raise RecordingError(f"{path}: expected a directory with .mcap files, or one such file; found none")
+            self._parts = [self._open(file) for file in files]
             self._counts = self._count()
             if not self._counts:
                 raise RecordingError(
@@ -114,12 +117,6 @@ class RecordingReader(Closing):
                     self.refused[topic] += 1
         except OSError as error:
             raise RecordingError(f"cannot read {self.path}: {error.strerror}") from error
-
-    def _find(self) -> list[Path]:
-        files = [self.path] if self.path.is_file() else sorted(self.path.glob("*.mcap"), key=_in_order)
-        if not files:
-            raise RecordingError(f"{self.path}: expected a directory with .mcap files, or one such file; found none")
-        return files
 
     def _open(self, path: Path) -> McapFile:
         try:

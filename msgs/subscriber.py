@@ -10,12 +10,13 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import zmq
 
 from steadypose.msgs import Closing
 from steadypose.msgs.codec import DecodeError, decode, typestore
-from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Listener, Principals, Taken
+from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, WRAP, Listener, Principals, Taken
 from steadypose.msgs.publisher import KEEPALIVE, milliseconds
 from steadypose.msgs.security import Keys, TransportError, check_private, is_local, loopback_keys, parse
 from steadypose.msgs.topics import TOPICS
@@ -181,9 +182,8 @@ class Subscriber(Closing):
     def take(self, number: int) -> None:
         """Acknowledge the oldest `number` messages to their publishers. With 0, only send a sign of life."""
         news = {(taken.publisher, taken.topic): taken for taken in (self._untaken.popleft() for _ in range(number))}
-        self._taken.update(news)
-        while len(self._taken) > _PUBLISHERS:
-            self._taken.popitem(last=False)
+        for key, taken in news.items():
+            _remember(self._taken, key, taken)
         for taken in news.values() if number else self._taken.values():
             self._tell(taken)
 
@@ -222,22 +222,23 @@ class Subscriber(Closing):
         if version != VERSION:
             return self._refuse("version")
         if not self._count(publisher, topic, sequence):
-            if taken := self._taken.get((publisher, topic)):  # the publisher resumed from an older acknowledgement
-                return self._tell(taken)
+            if known := self._taken.get((publisher, topic)):  # the publisher resumed from an older acknowledgement
+                return self._tell(known)
             return self._refuse("repeated")
         late = self._age_ns(publisher, sent_ns) > self._lifespan_ns
+        taken = Taken(self._listener.instance, publisher, (sequence + 1) % WRAP, topic)
         try:
             message = decode(topic, memoryview(frame)[end + 1 + PREFIX.size :])
         except DecodeError:
-            self._pass_over(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
+            self._pass_over(taken)
             return self._refuse("undecodable")
         if not isinstance(message, Diagnostics) and not self._principals.admits(
             topic, message.source, publisher, self._connection, ended=message.end_of_stream
         ):
-            self._pass_over(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
+            self._pass_over(taken)
             return self._refuse(SECOND)
         if topic in self._listener.reliable:
-            self._untaken.append(Taken(self._listener.instance, publisher, (sequence + 1) % 2**32, topic))
+            self._untaken.append(taken)
         if late and not isinstance(message, Diagnostics) and not message.end_of_stream:
             self.late[topic] += 1
             return None
@@ -257,16 +258,12 @@ class Subscriber(Closing):
 
     def _count(self, publisher: int, topic: str, sequence: int) -> bool:
         """Count the messages missing before `sequence`; False if it is not newer than the last one."""
-        missed = (sequence - self._expected.get((publisher, topic), sequence)) % 2**32
-        if missed >= 2**31:
+        missed = (sequence - self._expected.get((publisher, topic), sequence)) % WRAP
+        if missed >= WRAP // 2:
             return False
         if missed:
             self.dropped[topic] += missed
-        following = (sequence + 1) % 2**32
-        self._expected[publisher, topic] = following
-        self._expected.move_to_end((publisher, topic))
-        if len(self._expected) > _PUBLISHERS:
-            self._expected.popitem(last=False)
+        _remember(self._expected, (publisher, topic), (sequence + 1) % WRAP)
         if topic in self._listener.reliable and (publisher, topic) not in self._taken:
             self._taken[publisher, topic] = Taken(self._listener.instance, publisher, sequence, topic)
         return True
@@ -283,10 +280,7 @@ class Subscriber(Closing):
             return apart
         fastest, found_ns = self._offsets.get(publisher, (apart, now))
         fastest = min(apart, fastest + round((now - found_ns) * DRIFT))
-        self._offsets[publisher] = fastest, now
-        self._offsets.move_to_end(publisher)
-        if len(self._offsets) > _PUBLISHERS:
-            self._offsets.popitem(last=False)
+        _remember(self._offsets, publisher, (fastest, now))
         return apart - fastest
 
     def _refuse(self, cause: str) -> None:
@@ -317,6 +311,14 @@ class Subscriber(Closing):
         self._monitor.close(0)
         self.socket.close()
         self._context.term()
+
+
+def _remember(table: OrderedDict[Any, Any], key: object, value: object) -> None:
+    """Store a value as the newest, and drop the oldest beyond the limit."""
+    table[key] = value
+    table.move_to_end(key)
+    if len(table) > _PUBLISHERS:
+        table.popitem(last=False)
 
 
 def _check(endpoint: str, keys: Keys | None, clear_text: bool) -> None:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_EVENTS
 from steadypose.msgs.types import Message, Phase, PoseClean, PoseEvents, PoseWorld
-from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.prior.events.detector import NOWHERE, EventDetector, EventSettings
@@ -17,11 +16,7 @@ REPEAT_NS = 1_000_000_000
 
 
 class EventStream:
-    """Turns one stream of ``pose/world`` into ``pose/events``, given the sensor's position.
-
-    Args:
-        settings: the thresholds.
-    """
+    """Turns one stream of ``pose/world`` into ``pose/events``, given the sensor's position."""
 
     def __init__(self, settings: EventSettings) -> None:
         self._detector = EventDetector(settings)
@@ -45,8 +40,8 @@ class EventsNode(Node):
 
     name = "events"
 
-    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
-        super().__init__(launch, clock)
+    def __init__(self, launch: Launch) -> None:
+        super().__init__(launch)
         self._settings = launch.settings(EventSettings)
         self._streams: dict[str, EventStream] = {}
 

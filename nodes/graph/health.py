@@ -26,9 +26,6 @@ SAMPLES = 1000
 class Health:
     """The measurements of one node.
 
-    Args:
-        clock: the node's clock.
-
     Attributes:
         state: one or a few words: ``starting``, ``running``, ``waiting for prior``, ``stopped``. It is reported as
             ``stalled`` if frames come in and none go out.
@@ -94,13 +91,7 @@ class Health:
         ]
 
     def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
-        """Record a published message.
-
-        Args:
-            topic: its topic.
-            at_ns: monotonic time of publication, nanoseconds.
-            latency_ns: time since capture minus the intended delay, nanoseconds; None if unknown.
-        """
+        """Record a message published at a monotonic time, and its latency beyond the intended delay, nanoseconds."""
         self.published[topic] += 1
         if topic != DIAGNOSTICS:
             self._unanswered_ns = None
@@ -119,13 +110,10 @@ class Health:
     def report(
         self, node: str, received: Counter[str], status: Mapping[str, str], problems: Sequence[Problem] = ()
     ) -> Diagnostics:
-        """The current `diagnostics`.
+        """The current `diagnostics`. The worst problem sets the level and the message.
 
-        Args:
-            node: the node's name.
-            received: messages dropped or refused before the node processed them, by cause.
-            status: further entries of the node itself.
-            problems: problems of the node's stream. The worst one sets the level and the message.
+        ``received`` counts messages dropped or refused before the node processed them, by cause; ``status`` are the
+        node's own entries.
         """
         self._reported_at = self._clock.monotonic_ns()
         self._measure_rates()

@@ -34,11 +34,8 @@ class Inbox:
     Each subscriber (for example one per client of a server) has its own queue, and the queues take turns. A publisher
     that floods the node loses only its own messages.
 
-    Args:
-        subscribers: sources of the messages.
-        limit: largest number of waiting frames per stream; beyond it the oldest is dropped. With None nothing is
-            dropped, and the publisher has to wait (back-pressure).
-        clock: the node's clock.
+    ``limit`` is the largest number of waiting frames per stream; beyond it the oldest is dropped. With None nothing is
+    dropped, and the publisher has to wait (back-pressure).
     """
 
     def __init__(self, subscribers: Sequence[Subscriber], limit: int | None, clock: Clock) -> None:
@@ -186,12 +183,7 @@ BUSY = 0.5
 
 
 class BodyLimit:
-    """Limits the number of bodies: lowers it while frames are dropped, raises it again when there is spare time.
-
-    Args:
-        most: upper bound of the limit.
-        clock: the node's clock.
-    """
+    """Limits the number of bodies: lowers it while frames are dropped, raises it up to ``most`` in spare time."""
 
     def __init__(self, most: int, clock: Clock) -> None:
         self.bodies = self._most = most

@@ -91,10 +91,7 @@ def compile_missing(say: Callable[[str], None]) -> None:
     """Compile all loops that the nodes need and that are not on disk. Returns at once if none is missing.
 
     If they cannot be stored or compiled, it reports that and returns; each node then compiles them itself, or fails
-    with the reason.
-
-    Args:
-        say: receives progress lines.
+    with the reason. ``say`` receives progress lines.
     """
     if loop_cache.is_complete():
         return

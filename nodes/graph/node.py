@@ -78,7 +78,8 @@ class Node(ABC):
         self._timeline: Timeline | None = None
         self._set_ns = 0
         self.health = Health(self.clock)
-        self._stopping = False
+        self.stopping = False
+        """whether the node was asked to stop"""
         self._required = launch.reliable_subscribers(self.name)
         self._blocked_ns = 0
         self._disconnected: Counter[str] = Counter()
@@ -142,12 +143,7 @@ class Node(ABC):
 
     def stop(self) -> None:
         """Ask the node to stop. `run` returns within `POLL_S` plus the processing time of the current message."""
-        self._stopping = True
-
-    @property
-    def stopping(self) -> bool:
-        """Whether the node was asked to stop."""
-        return self._stopping
+        self.stopping = True
 
     def run(self) -> None:
         """Run the node until it is stopped.
@@ -200,7 +196,7 @@ class Node(ABC):
             self.report()
             notify(READY)
             self.work()
-            if self._supervisor and not self._stopping:
+            if self._supervisor and not self.stopping:
                 self._publisher.wait_for_subscribers({WATCHER}, timeout_s=LAST_WORD_S)
             self.health.state = "stopped"
             self.report()
@@ -216,7 +212,7 @@ class Node(ABC):
 
     def work(self) -> None:
         """Process messages until stopped."""
-        while not self._stopping:
+        while not self.stopping:
             self.take_next(POLL_S)
             self.report_if_due()
 
@@ -270,24 +266,20 @@ class Node(ABC):
     def publish(self, topic: str, message: Message, *, delay_ns: int = 0) -> bool:
         """Publish a message. In a lossless launch, wait until all reliable subscribers have room.
 
-        Args:
-            topic: its topic.
-            message: the message.
-            delay_ns: the pipeline's intended delay, nanoseconds of stream time; latency is measured beyond it.
-
-        Returns:
-            False if the node was stopped while it waited.
+        Latency is measured beyond ``delay_ns``, the pipeline's intended delay, nanoseconds of stream time. Returns
+        False if the node was stopped while it waited.
         """
         if self._relay and self._subscribers and self._relay.knows(topic, message):
             return True
         asked_ns = self.clock.monotonic_ns()
         self._await_subscribers()
         while not self._publisher.publish(topic, message, timeout_s=POLL_S):
-            if self._stopping:
+            if self.stopping:
                 self.health.counts[f"dropped.stopped {topic}"] += 1
                 return False
             if self.health.state == "running" and self.clock.monotonic_ns() - asked_ns > STALL_NS:
-                self.health.state = f"{WAITING} {', '.join(sorted(self._publisher.waited_for(topic)))} to go on"
+                waited_for = self._publisher.deliveries.waited_for(topic)
+                self.health.state = f"{WAITING} {', '.join(sorted(waited_for))} to go on"
             self.report_if_due()
         if self.health.state.startswith(WAITING):
             self.health.state = "running"
@@ -320,13 +312,13 @@ class Node(ABC):
         """Publish `diagnostics` now."""
         if self._supervisor and os.getppid() != self._supervisor:
             logger.error("%s: the process that started this node is gone; stopping", self.name)
-            self._stopping = True
+            self.stopping = True
         notify(ALIVE)
         self._publisher.check()
         if self._relay and self._subscribers:
             self._subscribers[0].take(0)  # a sign of life: a node that waits in `publish` must not count as deaf
-        self._disconnected, self._deaf = self._publisher.refused, self._publisher.silent(DEAF_S)
-        unread = self._publisher.silent(STALL_NS / 1e9)
+        self._disconnected, self._deaf = self._publisher.refused, self._publisher.deliveries.silent(DEAF_S)
+        unread = self._publisher.deliveries.silent(STALL_NS / 1e9)
         self.health.unread = f"{WAITING} {', '.join(sorted(unread))} to read" if unread else ""
         # a subscriber whose queue is full misses this report and gets the next one
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
@@ -377,6 +369,6 @@ class Node(ABC):
         logger.info("%s: waiting for %s", self.name, missing)
         state, self.health.state = self.health.state, f"{WAITING} {missing}"
         self.report()
-        while not self._stopping and not self._publisher.wait_for_subscribers(self._required, timeout_s=POLL_S):
+        while not self.stopping and not self._publisher.wait_for_subscribers(self._required, timeout_s=POLL_S):
             self.report_if_due()
         self.health.state = state

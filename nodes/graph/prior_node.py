@@ -83,8 +83,16 @@ class PriorNode(Node):
             if isinstance(self._pipeline, StreamBatch):
                 self._pipeline.heard(source, self.clock.monotonic_ns())
         found = self._checks.problems(now_ns, live=self.timeline is None or self.timeline.is_now)
-        if not self._checks.seen and now_ns - self._started_ns > self._patience_ns:
-            return [self._no_source(now_ns)]
+        patience_ns = OWN_SOURCE_NS if "pose_input" in self.launch.nodes else FOREIGN_SOURCE_NS
+        if not self._checks.seen and now_ns - self._started_ns > patience_ns:
+            since_s, addresses = (now_ns - self._started_ns) / 1e9, ", ".join(self.launch.addresses("pose_input"))
+            return [
+                error(
+                    "no_source",
+                    f"no {POSE_RAW} since the start {since_s:.0f} s ago: expected a publisher at {addresses}; start "
+                    "the tracker, or let it bind that address",
+                )
+            ]
         in_general = self._answers.problems()
         return [*(found or in_general), *self._overload()]
 
@@ -95,18 +103,6 @@ class PriorNode(Node):
                 f"this machine has time for {self._limit.bodies} of {self._pipeline.offered} bodies: those farthest "
                 "from the sensor are left out; switch off [prior.score] and [prior.impute], or use a faster machine",
             )
-
-    @property
-    def _patience_ns(self) -> int:
-        """Longest time until a source's first message, nanoseconds. A source of this launch has to start first."""
-        return OWN_SOURCE_NS if "pose_input" in self.launch.nodes else FOREIGN_SOURCE_NS
-
-    def _no_source(self, now_ns: int) -> Problem:
-        return error(
-            "no_source",
-            f"no {POSE_RAW} since the start {(now_ns - self._started_ns) / 1e9:.0f} s ago: expected a publisher at "
-            f"{', '.join(self.launch.addresses('pose_input'))}; start the tracker, or let it bind that address",
-        )
 
     def status(self) -> dict[str, str]:
         counts = {

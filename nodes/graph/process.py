@@ -21,12 +21,7 @@ _SCRIPT = (
 
 
 def own_command(function: str, *arguments: str) -> list[str]:
-    """The command line of a process that calls a function and exits with its return value.
-
-    Args:
-        function: as ``module:name``.
-        arguments: the process's `sys.argv[1:]`.
-    """
+    """The command line of a process that calls a function, ``module:name``, and exits with its return value."""
     return [sys.executable, "-c", _SCRIPT, function, *arguments]
 
 

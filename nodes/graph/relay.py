@@ -102,7 +102,7 @@ class Relay:
     def published(self, publisher: Publisher, topic: str, mark: tuple[int, int]) -> None:
         """Record a message that was just published."""
         if topic in self._topics:
-            self._untaken.append((topic, publisher.sequence(topic) - 1, mark))
+            self._untaken.append((topic, publisher.deliveries.sequence[topic] - 1, mark))
             self._published += 1
 
     def handled(self) -> None:
@@ -117,7 +117,7 @@ class Relay:
             self._taken += 1
         if newest is not None:
             untaken = {topic: sequence for topic, sequence, _ in reversed(self._untaken)}
-            following = [untaken.get(topic, publisher.sequence(topic)) for topic in self._topics]
+            following = [untaken.get(topic, publisher.deliveries.sequence[topic]) for topic in self._topics]
             first, second = (*following, 0)[:2]
             self._recent.append(Progress(publisher.id, (first, second), newest))
             self._keep(self._recent[0])

@@ -13,6 +13,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from steadypose.msgs import Closing
 from steadypose.msgs.security import local_directory, make_private
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.types import Diagnostics, Level
@@ -24,7 +25,7 @@ from steadypose.nodes.settings import LaunchError
 HEALTH_FILE = "health.json"
 
 
-class RunLock:
+class RunLock(Closing):
     """Locks the addresses of a run's nodes, and ``health.json`` if no other run holds it. A context manager.
 
     Attributes:
@@ -55,10 +56,7 @@ class RunLock:
             self.has_health = _take(stack, f"{directory}/health.lock") is None
             self._held = stack.pop_all()
 
-    def __enter__(self) -> RunLock:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._held.close()
 
 
@@ -85,11 +83,7 @@ LOSSES = ("dropped.", "refused.")
 
 
 class Ledger:
-    """Accumulates the counts of a run's nodes over restarts, because a restarted node counts from 0.
-
-    Args:
-        launch: the run's launch file.
-    """
+    """Accumulates the counts of a run's nodes over restarts, because a restarted node counts from 0."""
 
     def __init__(self, launch: Launch) -> None:
         self._launch = launch
@@ -154,13 +148,8 @@ def write_health(
     """Write ``health.json``, the state of a run, for monitoring a machine without a screen.
 
     The file is in the directory of the sockets and is replaced atomically once a second. Readers check its age first: a
-    file older than a few seconds is no longer written. A full disk, like any other OSError, is ignored.
-
-    Args:
-        directory: directory of the sockets.
-        required: nodes that must be running for ``ok``.
-        supervisor: the run's supervisor.
-        diagnostics: latest diagnostics by node name.
+    file older than a few seconds is no longer written. It is ``ok`` if all ``required`` nodes are running. A full disk,
+    like any other OSError, is ignored.
     """
     nodes = {name: _node(name, supervisor, diagnostics.get(name)) for name in supervisor.children}
     health = {

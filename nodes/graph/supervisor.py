@@ -176,14 +176,10 @@ class Supervisor:
         log: Callable[[str], None],
         run: str = "",
     ) -> None:
-        """Start the nodes.
+        """Start ``steadypose node NAME`` with the same arguments for each of the nodes.
 
-        Args:
-            nodes: names of the nodes.
-            arguments: arguments of ``steadypose node NAME``, the same for all nodes.
-            clock: monotonic time for restarts and timeouts.
-            log: receives each line of a node's output and each message about a node; called from several threads.
-            run: identifier of this run in its nodes' diagnostics.
+        ``log`` receives each line of a node's output and each message about a node; it is called from several threads.
+        ``run`` identifies this run in its nodes' diagnostics.
         """
         self._clock = clock
         self._polled_ns = clock.monotonic_ns()

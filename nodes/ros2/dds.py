@@ -30,7 +30,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
-from steadypose.nodes.ros2.definitions import DEPTH, Publish, ros_types, type_hash
+from steadypose.nodes.ros2.definitions import DEPTH, Publish, ros_types
 
 LOCALHOST = """<CycloneDDS><Domain>
 <General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>
@@ -62,7 +62,7 @@ class DdsConnection:
         policies = [
             Policy.Reliability.Reliable(duration(milliseconds=100)),
             Policy.History.KeepLast(1 if latched else DEPTH),
-            Policy.Userdata(f"typehash={type_hash(kind)};".encode()),
+            Policy.Userdata(f"typehash={ros_types().hash_rihs01(kind)};".encode()),
         ]
         if latched:
             policies.append(Policy.Durability.TransientLocal)

@@ -40,9 +40,8 @@ def new(kind: str, /, **fields: Any) -> Any:
 
 def header(stamp_ns: int, frame_id: str) -> Any:
     """``std_msgs/Header``."""
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
     types = ros_types().types
-    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)), frame_id)
 
 
 def stamp_ns(header: Any) -> int:
@@ -50,9 +49,9 @@ def stamp_ns(header: Any) -> int:
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def serialise(message: Any, name: str) -> bytes:
+def serialise(message: Any) -> bytes:
     """Encode a message as CDR, with the four-byte encapsulation header."""
-    return bytes(ros_types().serialize_cdr(message, name))
+    return bytes(ros_types().serialize_cdr(message, message.__msgtype__))
 
 
 def deserialise(cdr: bytes, name: str) -> Any:
@@ -62,11 +61,6 @@ def deserialise(cdr: bytes, name: str) -> Any:
         rosbags.serde.SerdeError: the bytes are not a message of this type.
     """
     return ros_types().deserialize_cdr(cdr, name)
-
-
-def type_hash(name: str) -> str:
-    """REP-2011's hash of a type, by which ROS 2 distinguishes versions of a type."""
-    return ros_types().hash_rihs01(name)
 
 
 @cache

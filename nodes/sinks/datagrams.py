@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 
 from steadypose.msgs.types import Message, PoseWorld, Tracking, WorldBody
-from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import check_host_and_port
@@ -137,8 +136,8 @@ class VmcNode(DatagramNode):
 
     name = "vmc"
 
-    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
-        super().__init__(launch, clock)
+    def __init__(self, launch: Launch) -> None:
+        super().__init__(launch)
         self._settings = launch.settings(VmcSettings)
         self._followed = Followed()
         self._first_ns: int | None = None

@@ -8,8 +8,6 @@ extension that maps nodes to a humanoid's bones (VRMC_vrm_animation 1.0).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import count
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,16 +87,15 @@ def _file(motion: BodyMotion, names: Sequence[str], at_rest: bool) -> bytes:
             for k, (joint, path, _) in enumerate(tracks)
         ],
     )
-    return file.finish(GLTF2(
+    result = GLTF2(
         scene=0, scenes=[Scene(nodes=[0, 22])], nodes=[*nodes, Node(name="body", mesh=0, skin=0)], meshes=[mesh],
-        skins=[skin], animations=[animation], **(_humanoid(names) if at_rest else {}),
-    ))  # fmt: skip
-
-
-def _humanoid(names: Sequence[str]) -> dict[str, Any]:
-    bones = {name: {"node": joint} for joint, name in enumerate(names)}
-    vrma = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
-    return {"extensionsUsed": ["VRMC_vrm_animation"], "extensions": {"VRMC_vrm_animation": vrma}}
+        skins=[skin], animations=[animation],
+    )  # fmt: skip
+    if at_rest:
+        bones = {name: {"node": joint} for joint, name in enumerate(names)}
+        result.extensionsUsed = ["VRMC_vrm_animation"]
+        result.extensions = {"VRMC_vrm_animation": {"specVersion": "1.0", "humanoid": {"humanBones": bones}}}
+    return file.finish(result)
 
 
 class _Glb:
@@ -140,8 +137,8 @@ def _octahedra(rest: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     points: list[NDArray[np.float64]] = []
     triangles: list[list[int]] = []
     ring = [1, 2, 3, 4]
-    for bone, (joint, parent) in zip(count(), list(enumerate(PARENTS))[1:], strict=False):
-        start, along = rest[parent], rest[joint] - rest[parent]
+    for bone, parent in enumerate(PARENTS[1:]):
+        start, along = rest[parent], rest[bone + 1] - rest[parent]
         aside = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
         aside *= WIDTH * np.linalg.norm(along) / np.linalg.norm(aside)
         over = np.cross(along, aside) / np.linalg.norm(along)

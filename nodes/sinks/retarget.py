@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from steadypose.msgs.types import CONTACTS, PoseWorld, WorldBody
-from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.settings import LaunchError, path_setting
@@ -84,8 +83,8 @@ class RetargetNode(DatagramNode):
 
     name = "retarget"
 
-    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
-        super().__init__(launch, clock)
+    def __init__(self, launch: Launch) -> None:
+        super().__init__(launch)
         one_thread()
         self._settings = settings = launch.settings(RetargetSettings)
         self._robot = load_robot(Path(settings.urdf), settings.links)
@@ -126,25 +125,17 @@ class RobotPose(NamedTuple):
     """whether the left and the right foot are held in place"""
 
 
+@dataclass
 class _Foot:
     """The state of one foot: where it stands, or its progress of being released (``free``, 0 to 1)."""
 
-    def __init__(self) -> None:
-        self.stood: tuple[Floats, Floats] | None = None
-        self.stands = False
-        self.free = 1.0
-
-    def reset(self) -> None:
-        self.stood, self.stands, self.free = None, False, 1.0
+    stood: tuple[Floats, Floats] | None = None
+    stands: bool = False
+    free: float = 1.0
 
 
 class Retargeter:
-    """Retargets one person's motion to a robot.
-
-    Args:
-        robot: the robot.
-        sole: height of its foot links' origins above the floor when standing, metres.
-    """
+    """Retargets one person's motion to a robot, whose foot links' origins stand ``sole`` metres above the floor."""
 
     def __init__(self, robot: Robot, sole: float = 0.0) -> None:
         import mink
@@ -192,8 +183,7 @@ class Retargeter:
         """Forget the person, so that the next one is started afresh."""
         self._stamp_ns = None
         self._velocity[:] = 0.0
-        for foot in self._feet:
-            foot.reset()
+        self._feet = (_Foot(), _Foot())
 
     def follow(self, stamp_ns: int, body: WorldBody) -> RobotPose | None:
         """The robot's pose for a person's at ``stamp_ns``; None if that is unknown, or not later than the last."""
@@ -210,7 +200,11 @@ class Retargeter:
             self._stamp_ns = stamp_ns
             share = float(minimum_jerk((stamp_ns - self._began_ns) / 1e9 / EASE_S))
             self._aim(body, dt, begun=share >= 1.0)
-            self._step(dt, share)
+            wanted = self._mink.solve_ik(
+                self._configuration, list(self._tasks.values()), dt, "daqp", damping=1e-4, limits=self._limits
+            )
+            self._velocity = share * wanted
+            self._integrate(dt)
         return self._pose(stamp_ns)
 
     def coast(self, stamp_ns: int) -> RobotPose | None:
@@ -220,9 +214,8 @@ class Retargeter:
         dt = min((stamp_ns - self._stamp_ns) / 1e9, EASE_S)
         self._velocity *= np.exp(-5.0 * dt / EASE_S)
         self._stamp_ns = self._began_ns = stamp_ns  # so that a person who returns is eased into
-        for foot in self._feet:
-            foot.reset()
-        self._integrate(self._velocity, dt)
+        self._feet = (_Foot(), _Foot())
+        self._integrate(dt)
         return self._pose(stamp_ns)
 
     def _begin(self, stamp_ns: int, body: WorldBody) -> None:
@@ -256,17 +249,14 @@ class Retargeter:
             self._set(f"{side}_elbow", None, elbow)
             self._set(f"{side}_wrist", None, elbow + self._arm[k][1] * _direction(p, f"{side}_elbow", f"{side}_wrist"))
             touching = max(body.contacts[CONTACTS.index(f"{side}_{part}")] for part in ("ankle", "foot"))
-            turn, place = self._foot_target(turns[J[f"{side}_ankle"]], p[J[f"{side}_ankle"]], k)
+            turn = turns[J[f"{side}_ankle"]] @ self._rest[f"{side}_foot"][0]
+            place = self._to_robot(p[J[f"{side}_ankle"]])
+            place[2] = max(place[2], self._sole)
             self._set(f"{side}_foot", *self._held(k, turn, place, float(touching), dt, begun=begun))
 
     def _to_robot(self, point: Floats) -> Floats:
         """A point (3,) of the person, scaled to the robot's world."""
         return self._scale * (point - [0.0, 0.0, ANKLE]) + [0.0, 0.0, self._sole]
-
-    def _foot_target(self, turn: Floats, ankle: Floats, k: int) -> tuple[Floats, Floats]:
-        place = self._to_robot(ankle)
-        place[2] = max(place[2], self._sole)
-        return turn @ self._rest[f"{SIDES[k]}_foot"][0], place
 
     def _held(
         self, k: int, turn: Floats, place: Floats, touching: float, dt: float, *, begun: bool
@@ -289,15 +279,8 @@ class Retargeter:
             return turn, place
         return turn, foot.stood[1] + float(minimum_jerk(foot.free)) * (place - foot.stood[1])
 
-    def _step(self, dt: float, share: float) -> None:
-        wanted = self._mink.solve_ik(
-            self._configuration, list(self._tasks.values()), dt, "daqp", damping=1e-4, limits=self._limits
-        )
-        self._velocity = share * wanted
-        self._integrate(self._velocity, dt)
-
-    def _integrate(self, velocity: Floats, dt: float) -> None:
-        q = self._configuration.integrate(velocity, dt)
+    def _integrate(self, dt: float) -> None:
+        q = self._configuration.integrate(self._velocity, dt)
         before = self._configuration.q[self._q_indices]
         most = self.robot.speed * dt
         q[self._q_indices] = np.clip(
@@ -334,12 +317,7 @@ def _length(p: Floats, *joints: str) -> float:
 
 
 class Follower:
-    """Computes a robot's poses for a stream of ``pose/world``, following one person until they are gone.
-
-    Args:
-        retargeter: the robot's retargeter.
-        body: id of the person to follow; None: the first one present, then the next.
-    """
+    """Computes a robot's poses for a stream of ``pose/world``, following one person (`Followed`)."""
 
     def __init__(self, retargeter: Retargeter, body: int | None = None) -> None:
         self._retargeter, self._followed = retargeter, Followed(body)

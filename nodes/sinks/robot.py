@@ -65,11 +65,7 @@ class Robot:
 
 
 def load_robot(path: Path, links: Mapping[str, str]) -> Robot:
-    """Read a URDF.
-
-    Args:
-        path: path of the file.
-        links: part to link, where the link's name does not show it.
+    """Read a URDF; ``links`` are those of the parts whose link's name does not show it.
 
     Raises:
         LaunchError: the file cannot be read, a joint has no limits, or no link is found for a part.
@@ -123,13 +119,9 @@ def _limits(root: ET.Element, path: Path) -> dict[str, tuple[float, float, float
 
 def _prepare(root: ET.Element) -> None:
     """Remove everything but the kinematics, in place."""
-    for link in [*root, *root.findall("link")]:
-        for shape in _SHAPES:
-            for element in link.findall(shape):
-                link.remove(element)
-    for shape in _SHAPES:
-        for element in root.findall(shape):
-            root.remove(element)
+    for parent in [root, *root]:
+        for element in [child for child in parent if child.tag in _SHAPES]:
+            parent.remove(element)
     settings = ET.SubElement(root, "mujoco")
     # kinematics need no masses, so a link without one must not make MuJoCo refuse the robot
     ET.SubElement(

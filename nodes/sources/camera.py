@@ -62,9 +62,7 @@ class Connection(Protocol):
 class CameraSource(LiveSource):
     """The skeletons of a camera. While it is disconnected, it is retried forever at growing intervals.
 
-    Args:
-        clock: the node's clock.
-        connect: opens the camera; raises RuntimeError if it cannot be opened at present.
+    ``connect`` opens the camera; it raises RuntimeError if it cannot be opened at present.
     """
 
     def __init__(self, clock: Clock, connect: Callable[[], AbstractContextManager[Connection]]) -> None:
@@ -208,7 +206,10 @@ class MergeSource(LiveSource):
         self._lost: Counter[str] = Counter()
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        with self._subscriber() as subscriber:
+        context = self._context
+        with Subscriber(
+            self._addresses, POSE_RAW, keys=context.keys, clear_text=context.clear_text, lifespan_s=LATE_S, name="merge"
+        ) as subscriber:
             self._lost = subscriber.dropped
             while True:
                 received = subscriber.receive(POLL_S)
@@ -218,12 +219,6 @@ class MergeSource(LiveSource):
                 self._received[received[1].source] += 1
                 yield from self._merge.update(received[1]) or [None]
                 self.refused = self._merge.counters + subscriber.refused
-
-    def _subscriber(self) -> Subscriber:
-        context = self._context
-        return Subscriber(
-            self._addresses, POSE_RAW, keys=context.keys, clear_text=context.clear_text, lifespan_s=LATE_S, name="merge"
-        )
 
     def status(self) -> dict[str, str]:
         cameras = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._received.items())}

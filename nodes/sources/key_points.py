@@ -11,9 +11,7 @@ body's surface from a depth camera.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +90,9 @@ def read_key_points(path: Path) -> KeyPointRecording:
         pose = Pose.from_up(str(arrays.get("up", "-y")))
     except ValueError as error:
         raise NpzError(f"{path}: {error}") from error
-    stamps = _stamps(path, arrays, len(keypoints))
+    stamps = read_stamps(path, arrays, len(keypoints))
+    if (np.diff(stamps) <= 0).any() or stamps[-1] - stamps[0] > LONGEST_NS:
+        raise NpzError(f"{path}: stamp_ns: expected stamps that grow, by {LONGEST_NS / 1e9:g} s at most in all")
     weights = layout.to_canonical
     pixels = np.einsum("cj,tjx->tcx", weights, np.nan_to_num(keypoints))
     found = np.isfinite(keypoints).all(axis=-1)
@@ -114,13 +114,6 @@ def read_key_points(path: Path) -> KeyPointRecording:
         None if height is None else height.item(),
         None if points is None else in_sight(np.asarray(points, dtype=np.float64)[nearest]),
     )  # fmt: skip
-
-
-def _stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
-    stamps = read_stamps(path, arrays, frames)
-    if (np.diff(stamps) <= 0).any() or stamps[-1] - stamps[0] > LONGEST_NS:
-        raise NpzError(f"{path}: stamp_ns: expected stamps that grow, by {LONGEST_NS / 1e9:g} s at most in all")
-    return stamps
 
 
 def _on_grid(

@@ -282,9 +282,7 @@ SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")
 class MotionSource(ArraySource):
     """The body in a motion capture file, in canonical joints, z up.
 
-    Args:
-        path: path of the file.
-        rig: description for what the file itself lacks (`prior.mocap.files.Description`), as a TOML table.
+    ``rig`` says what the file itself lacks (`prior.mocap.files.Description`), as a TOML table.
 
     Raises:
         MotionError: the file cannot be read, or no body is recognised in it.

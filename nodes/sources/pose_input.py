@@ -164,12 +164,7 @@ class PoseInputNode(Node):
             shift_ns += newest_ns - first_ns + LOOP_PAUSE_NS
 
     def _wait_for(self, stamp_ns: int, due_stamp_ns: int) -> None:
-        """Wait until a frame is due. If the source's clock was set, restart the timeline from now.
-
-        Args:
-            stamp_ns: stamp of the frame.
-            due_stamp_ns: stamp at whose playback time the frame is due.
-        """
+        """Wait until ``due_stamp_ns`` is played. If the source's clock was set, restart the timeline from now."""
         last_ns, self._last_ns = self._last_ns, stamp_ns
         if not self._rate:
             return

@@ -102,14 +102,7 @@ def open_input(
     clear_text: bool = False,
     image_file: Path | None = None,
 ) -> RecordedSource | LiveSource:
-    """Open the source that ``[input]`` names.
-
-    Args:
-        settings: ``[input]`` of the launch file.
-        clock: the node's clock.
-        keys: keys for cameras on other machines.
-        clear_text: whether to subscribe to other machines without keys.
-        image_file: file for the newest image, if ``[input] image`` is set.
+    """Open the source that ``[input]`` names, with the rest as in `SourceContext`.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
@@ -172,10 +173,9 @@ class TfSource(LiveSource):
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         connection = self._join("steadypose_tf")
         try:
-            connection.subscribe("tf", TF_MESSAGE, lambda cdr: self._heard(cdr, static=False), depth=100)
-            connection.subscribe(
-                "tf_static", TF_MESSAGE, lambda cdr: self._heard(cdr, static=True), latched=True, depth=100
-            )
+            for topic, static in (("tf", False), ("tf_static", True)):
+                heard = partial(self._heard, static=static)
+                connection.subscribe(topic, TF_MESSAGE, heard, latched=static, depth=100)
             with closing(self._source.frames()) as frames:
                 for frame in frames:
                     if frame:
@@ -199,13 +199,12 @@ class TfSource(LiveSource):
             except TransformError as trouble:
                 if self._clock.now_ns() - came_ns < self._settings.timeout * 1e9:
                     return
-                self._waiting.popleft()
                 self._trouble = str(trouble)
                 self.refused["without a transform"] += 1
-                continue
+            else:
+                self._trouble = ""
+                yield dataclasses.replace(frame, sensor_pose=Pose(place, turned), calibrated=True)
             self._waiting.popleft()
-            self._trouble = ""
-            yield dataclasses.replace(frame, sensor_pose=Pose(place, turned), calibrated=True)
 
     def problems(self) -> list[Problem]:
         found = self._source.problems()

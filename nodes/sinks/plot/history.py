@@ -76,23 +76,6 @@ class History:
     def bodies(self) -> list[int]:
         return sorted({body for tracks in self.tracks.values() for body in tracks})
 
-    def longest(self) -> int | None:
-        """The body with the most messages on the first of clean, world, raw and truth that has any."""
-        for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH):
-            if bodies := self.tracks.get(topic):
-                return max(bodies, key=lambda body: len(bodies[body].time))
-        return None
-
-
-def read_history(recording: Path) -> History:
-    """Read a recording as arrays."""
-    with RecordingReader(recording) as reader:
-        history = gather(reader.path.name, reader, reader.start_ns)
-        history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
-        if not reader.complete:
-            history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
-    return history
-
 
 def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
     """The history of an output of ``clean``, ``complete`` or ``fit`` given as arrays; or of an input.
@@ -112,9 +95,14 @@ def history_of_path(path: Path) -> History:
     """
     if path.suffix == ".npz" and path.exists():
         return history_of_arrays(read_arrays(path), path.name)
-    return (
-        read_history(path) if path.is_dir() or path.suffix == ".mcap" else _of_source(path.name, open_recording(path))
-    )
+    if not path.is_dir() and path.suffix != ".mcap":
+        return _of_source(path.name, open_recording(path))
+    with RecordingReader(path) as reader:
+        history = gather(path.name, reader, reader.start_ns)
+        history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
+        if not reader.complete:
+            history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
+    return history
 
 
 def _of_source(name: str, messages: Iterable[tuple[str, Message]]) -> History:
@@ -220,10 +208,7 @@ def errors_of(history: History, body: int) -> dict[str, TrackError]:
 def _distances(track: Track, truth: Track, *, placed: bool) -> NDArray[np.float64]:
     """(T, 22) distances between a track's joints and the ground truth at the same times, metres; NaN where missing.
 
-    Args:
-        track: the track.
-        truth: one person's ground truth.
-        placed: whether the track's position in the world is known; otherwise it is first aligned to the truth.
+    A track that is not ``placed`` in the world is first aligned to the truth.
     """
     index = np.clip(np.searchsorted(truth.time, track.time), 1, len(truth.time) - 1)
     before, after = truth.time[index - 1], truth.time[index]
@@ -265,9 +250,11 @@ def body_of(history: History, body: int | None) -> int:
     Raises:
         PlotError: there are no bodies, or not the requested one.
     """
-    chosen = history.longest() if body is None else body
-    if chosen is None:
+    if not history.tracks:
         raise PlotError(f"{history.name}: expected bodies on a pose topic, found none; there is nothing to draw")
-    if chosen not in history.bodies:
-        raise PlotError(f"body: expected one of {history.bodies}, got {chosen}")
-    return chosen
+    if body is None:
+        tracks = next(history.tracks[t] for t in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if t in history.tracks)
+        return max(tracks, key=lambda body: len(tracks[body].time))
+    if body not in history.bodies:
+        raise PlotError(f"body: expected one of {history.bodies}, got {body}")
+    return body

@@ -87,8 +87,7 @@ def write_video(history: History, path: Path, body: int | None = None) -> int:
 class View:
     """An orthographic projection of the world's points to the image's right and up.
 
-    Args:
-        front: (3,) horizontal unit vector that faces the viewer, except for a rotation by `TURNED`.
+    The viewer is in the direction ``front`` (3,), a horizontal unit vector, rotated by `TURNED`.
     """
 
     def __init__(self, front: Floats) -> None:
@@ -233,14 +232,7 @@ def _palette() -> list[int]:
 
 
 def _write_gif(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float, *, shades: bool = True) -> int:
-    """Write a GIF. Returns the number of frames.
-
-    Args:
-        frames: RGB images (H, W, 3).
-        path: path of the file.
-        fps: frame rate, Hz.
-        shades: whether to use the palette of `SHADES`; otherwise each image has its own palette.
-    """
+    """Write a GIF with the palette of `SHADES`, or with one of each image. Returns the number of frames."""
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from steadypose import PACKAGE
 from steadypose.msgs.types import Message, PoseWorld
 from steadypose.nodes.checks.problem import Problem, warning
-from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.ros2 import check_ros, connect
@@ -111,9 +110,8 @@ class FoxgloveOutput:
     def repeat(self, channel: str) -> None:
         """Send a channel's latched message again, if there is one."""
         topic = channel.removeprefix("/")
-        open_one, cdr = self._channels.get(topic), self._latched.get(topic)
-        if open_one and cdr is not None:
-            open_one.log(cdr)
+        if topic in self._latched:
+            self._channels[topic].log(self._latched[topic])
 
     def drop(self, topic: str) -> None:
         self._latched.pop(topic, None)
@@ -138,17 +136,13 @@ class Ros2BridgeNode(RosMessagesNode):
     """Publishes bodies in ROS 2."""
 
     name = "ros2_bridge"
-
-    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
-        super().__init__(launch, clock)
-        check_ros()
-        self._settings = launch.settings(Ros2BridgeSettings)
-        self._bodies = 0
-        self._output: RosOutput | None = None
+    _bodies = 0
+    _output: RosOutput | None = None
 
     def work(self) -> None:
         from steadypose.nodes.sinks.ros2.messages import BodyTopics  # not needed to read a launch file; so below
 
+        self._settings = self.launch.settings(Ros2BridgeSettings)
         connection = connect("steadypose_bridge", self._settings.namespace)
         try:
             self._output = RosOutput(connection, self._settings.namespace)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.codec import encode
+from steadypose.msgs.codec import encode, wire_type
 from steadypose.msgs.types import (
     Diagnostics,
     JointState,
@@ -23,9 +23,10 @@ from steadypose.msgs.types import (
     WorldBody,
 )
 from steadypose.nodes.ros2.definitions import header, new, serialise
+from steadypose.nodes.sinks.drawing import ALL_BONES
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
 from steadypose.prior.body.kinematics import rotation_matrix
-from steadypose.prior.body.skeleton import PARENTS, J
+from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.posture import RootCovariance
 
 if TYPE_CHECKING:
@@ -73,20 +74,15 @@ def marker_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
 def odometry(world: PoseWorld, name: str, body: WorldBody, turn_covariance: np.ndarray) -> Any:
     """``nav_msgs/Odometry`` of a body's root: pose in the world, velocity in its own frame, both with covariance.
 
-    Angular velocity is not estimated; its variance is `UNKNOWN_VARIANCE`.
-
-    Args:
-        world: the message.
-        name: name of the body.
-        body: a body of the message.
-        turn_covariance: (3, 3) covariance of the root's orientation about the world's axes, rad².
+    ``turn_covariance`` is (3, 3), of the root's orientation about the world's axes, rad². Angular velocity is not
+    estimated; its variance is `UNKNOWN_VARIANCE`.
     """
     turned = Rotation.from_quat(body.root_orientation).as_matrix()
     pose_covariance, twist_covariance = np.eye(6) * UNKNOWN_VARIANCE, np.eye(6) * UNKNOWN_VARIANCE
     pose_covariance[:3, :3], pose_covariance[3:, 3:] = body.covariance[:3, :3], turn_covariance
     twist_covariance[:3, :3] = turned.T @ body.covariance[3:, 3:] @ turned
     pose = _pose(body.root_position, body.root_orientation)
-    twist = new("geometry_msgs/msg/Twist", linear=_vector(turned.T @ body.root_velocity))
+    twist = new("geometry_msgs/msg/Twist", linear=_geometry("Vector3", turned.T @ body.root_velocity))
     return new(
         "nav_msgs/msg/Odometry",
         header=header(world.stamp_ns, world.frame_id),
@@ -94,21 +90,6 @@ def odometry(world: PoseWorld, name: str, body: WorldBody, turn_covariance: np.n
         pose=new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=pose_covariance.ravel()),
         twist=new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=twist_covariance.ravel()),
     )
-
-
-def joint_state(world: PoseWorld, name: str, angles: Mapping[str, float]) -> Any:
-    """``sensor_msgs/JointState`` of REP-155's joints."""
-    return new(
-        "sensor_msgs/msg/JointState",
-        header=header(world.stamp_ns, world.frame_id),
-        name=[f"{joint}_{name}" for joint in angles],
-        position=np.array(list(angles.values())),
-    )
-
-
-def ids_list(world: PoseWorld, names: list[str]) -> Any:
-    """``hri_msgs/IdsList`` of the tracked bodies."""
-    return new("hri_msgs/msg/IdsList", header=header(world.stamp_ns, world.frame_id), ids=names)
 
 
 def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
@@ -134,7 +115,11 @@ def transform(stamp_ns: int, parent: str, child: str, place: np.ndarray, quatern
         "geometry_msgs/msg/TransformStamped",
         header=header(stamp_ns, parent),
         child_frame_id=child,
-        transform=new("geometry_msgs/msg/Transform", translation=_vector(place), rotation=_quaternion(quaternion)),
+        transform=new(
+            "geometry_msgs/msg/Transform",
+            translation=_geometry("Vector3", place),
+            rotation=_geometry("Quaternion", quaternion),
+        ),
     )
 
 
@@ -155,25 +140,14 @@ def diagnostic_array(diagnostics: Diagnostics) -> Any:
     return new("diagnostic_msgs/msg/DiagnosticArray", header=header(diagnostics.stamp_ns, ""), status=[status])
 
 
-def clock(stamp_ns: int) -> Any:
-    """``rosgraph_msgs/Clock``."""
-    return new("rosgraph_msgs/msg/Clock", clock=header(stamp_ns, "").stamp)
-
-
-def _vector(values: np.ndarray) -> Any:
-    return new("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, values), strict=True)))
-
-
-def _point(values: np.ndarray) -> Any:
-    return new("geometry_msgs/msg/Point", **dict(zip("xyz", map(float, values), strict=True)))
-
-
-def _quaternion(values: np.ndarray) -> Any:
-    return new("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
+def _geometry(kind: str, values: Iterable[float]) -> Any:
+    """A message of geometry_msgs with the fields x, y, z and, of a quaternion, w."""
+    return new(f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", map(float, values), strict=False)))
 
 
 def _pose(place: np.ndarray, quaternion: np.ndarray) -> Any:
-    return new("geometry_msgs/msg/Pose", position=_point(place), orientation=_quaternion(quaternion))
+    position, orientation = _geometry("Point", place), _geometry("Quaternion", quaternion)
+    return new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
 
 def _joint_poses(body: WorldBody) -> Iterator[Any]:
@@ -183,7 +157,8 @@ def _joint_poses(body: WorldBody) -> Iterator[Any]:
 
 
 def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
-    points, colours = [_point(place) for place in body.positions], [COLOURS[int(state)] for state in body.state]
+    points = [_geometry("Point", place) for place in body.positions]
+    colours = [COLOURS[int(state)] for state in body.state]
     life = new("builtin_interfaces/msg/Duration", nanosec=round(MARKER_LIFE_S * 1e9))
 
     def mark(kind: int, part: str, scale: tuple[float, float, float], **more: Any) -> Any:
@@ -192,24 +167,20 @@ def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
             header=where,
             ns=f"{name}/{part}",
             type=kind,
-            scale=_vector(np.array(scale)),
+            scale=_geometry("Vector3", scale),
             lifetime=life,
             **{"pose": _pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))} | more,
         )
 
-    ends = [joint for child, parent in enumerate(PARENTS) if parent >= 0 for joint in (parent, child)]
     above = body.positions[J["head"]] + [0.0, 0.0, 3 * TEXT_SIZE]
-    root, velocity = body.root_position, body.root_velocity
+    arrow = [_geometry("Point", end) for end in (body.root_position, body.root_position + body.root_velocity)]
     return [
         mark(SPHERE_LIST, "joints", (JOINT_SIZE, JOINT_SIZE, JOINT_SIZE), points=points, colors=colours),
         mark(
-            LINE_LIST, "bones", (BONE_WIDTH, 0.0, 0.0), points=[points[joint] for joint in ends],
-            colors=[colours[child] for child, parent in enumerate(PARENTS) if parent >= 0 for _ in range(2)],
+            LINE_LIST, "bones", (BONE_WIDTH, 0.0, 0.0), points=[points[joint] for joint in ALL_BONES.ravel()],
+            colors=[colours[child] for child in ALL_BONES[:, 1].repeat(2)],
         ),
-        mark(
-            ARROW, "velocity", (BONE_WIDTH, 2 * BONE_WIDTH, 0.0), points=[_point(root), _point(root + velocity)],
-            color=_colour(1.0, 1.0, 1.0, 0.8),
-        ),
+        mark(ARROW, "velocity", (BONE_WIDTH, 2 * BONE_WIDTH, 0.0), points=arrow, color=_colour(1.0, 1.0, 1.0, 0.8)),
         mark(
             TEXT_VIEW_FACING, "name", (0.0, 0.0, TEXT_SIZE), color=_colour(1.0, 1.0, 1.0),
             text=name if body.tracking == Tracking.OK else f"{name}, {body.tracking.name.lower()}",
@@ -226,13 +197,11 @@ def names_of(world: PoseWorld) -> tuple[dict[str, WorldBody], int]:
 
 
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
+OWN_TOPICS = {PoseRaw: "pose_raw", PoseClean: "pose_clean", PoseWorld: "pose_world", PoseEvents: "pose_events"}
 GROWN = 0.02
 """Change of a link's length at which the body's URDF is published again, metres."""
-OF_BODY = {
-    "joint_states": "sensor_msgs/msg/JointState",
-    "odom": "nav_msgs/msg/Odometry",
-    "urdf": "std_msgs/msg/String",
-}
+OF_BODY = ("joint_states", "odom", "urdf")
+"""Topics of each body."""
 
 
 class Output(Protocol):
@@ -244,12 +213,7 @@ class Output(Protocol):
 
 
 class BodyTopics:
-    """Sends steadypose's messages to ROS topics.
-
-    Args:
-        output: receiver of the serialised messages.
-        settings: the bridge's settings.
-    """
+    """Sends steadypose's messages to ROS topics."""
 
     def __init__(self, output: Output, settings: Ros2BridgeSettings) -> None:
         self._output, self._settings = output, settings
@@ -261,43 +225,42 @@ class BodyTopics:
     def send(self, message: Message) -> int:
         """Send a message. Returns the number of its bodies that were not sent because their pose is not finite."""
         if isinstance(message, Diagnostics):
-            self._send("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", diagnostic_array(message))
-        elif isinstance(message, PoseRaw):
-            self._output.send("steadypose/pose_raw", "steadypose_msgs/msg/PoseRaw", encode(message))
-        elif isinstance(message, PoseClean):
-            self._output.send("steadypose/pose_clean", "steadypose_msgs/msg/PoseClean", encode(message))
+            self._send("diagnostics", diagnostic_array(message))
+            return 0
+        if isinstance(message, PoseEvents | PoseWorld):
+            message = dataclasses.replace(message, frame_id=self._settings.world_frame)
+        topic = OWN_TOPICS[type(message)]
+        self._output.send(f"steadypose/{topic}", wire_type(type(message)), encode(message))
+        if isinstance(message, PoseClean):
             self._send_sensor(message)
-        elif isinstance(message, PoseEvents):
-            events = dataclasses.replace(message, frame_id=self._settings.world_frame)
-            self._output.send("steadypose/pose_events", "steadypose_msgs/msg/PoseEvents", encode(events))
-        elif isinstance(message, PoseWorld):
-            return self._send_world(dataclasses.replace(message, frame_id=self._settings.world_frame))
-        return 0
+        return self._send_world(message) if isinstance(message, PoseWorld) else 0
 
     def send_clock(self, stamp_ns: int) -> None:
         """Publish the time of a replay."""
-        self._send("clock", "rosgraph_msgs/msg/Clock", clock(max(stamp_ns, 0)))
+        self._send("clock", new("rosgraph_msgs/msg/Clock", clock=header(max(stamp_ns, 0), "").stamp))
 
     def _send_world(self, world: PoseWorld) -> int:
-        self._output.send("steadypose/pose_world", "steadypose_msgs/msg/PoseWorld", encode(world))
+        where = header(world.stamp_ns, world.frame_id)
         bodies, refused = names_of(world)
         for gone in self._measured.keys() - bodies.keys():
             del self._measured[gone]
             for topic in OF_BODY:
                 self._output.drop(f"{BODIES}/{gone}/{topic}")
-        self._send(f"{BODIES}/tracked", "hri_msgs/msg/IdsList", ids_list(world, list(bodies)))
-        self._send(MARKERS, "visualization_msgs/msg/MarkerArray", marker_array(world, bodies))
-        self._send(POSES, "geometry_msgs/msg/PoseArray", pose_array(world, bodies))
+        self._send(f"{BODIES}/tracked", new("hri_msgs/msg/IdsList", header=where, ids=list(bodies)))
+        self._send(MARKERS, marker_array(world, bodies))
+        self._send(POSES, pose_array(world, bodies))
         transforms: list[Any] = []
         for name, body in bodies.items():
             links = frames(body)
             transforms += body_transforms(world, name, links)
-            state = joint_state(world, name, joint_angles(links))
-            self._send_of(name, "joint_states", state)
-            self._send_of(name, "odom", odometry(world, name, body, self._turn_covariance(body)))
+            angles = joint_angles(links)
+            joints, position = [f"{joint}_{name}" for joint in angles], np.array(list(angles.values()))
+            state = new("sensor_msgs/msg/JointState", header=where, name=joints, position=position)
+            self._send(f"{BODIES}/{name}/joint_states", state)
+            self._send(f"{BODIES}/{name}/odom", odometry(world, name, body, self._turn_covariance(body)))
             self._send_urdf(name, measures(body))
         if transforms:
-            self._send("tf", "tf2_msgs/msg/TFMessage", tf_message(transforms))
+            self._send("tf", tf_message(transforms))
         return refused
 
     def _turn_covariance(self, body: WorldBody) -> np.ndarray:
@@ -309,7 +272,8 @@ class BodyTopics:
         last = self._measured.get(name)
         if last is None or max(np.abs(measured[link] - at).max() for link, at in last.items()) > GROWN:
             self._measured[name] = measured
-            self._send_of(name, "urdf", new("std_msgs/msg/String", data=urdf(name, measured)), latched=True)
+            told = new("std_msgs/msg/String", data=urdf(name, measured))
+            self._send(f"{BODIES}/{name}/urdf", told, latched=True)
 
     def _send_sensor(self, clean: PoseClean) -> None:
         """Publish a sensor's pose: of a static sensor once on /tf_static, of a moving one on /tf with each message.
@@ -333,12 +297,9 @@ class BodyTopics:
                 self._moving.add(frame)
                 del self._still[frame]
             still = tf_message([placed(*sensor) for sensor in self._still.items()])
-            self._send("tf_static", "tf2_msgs/msg/TFMessage", still, latched=True)
+            self._send("tf_static", still, latched=True)
         if frame in self._moving:
-            self._send("tf", "tf2_msgs/msg/TFMessage", tf_message([placed(frame, pose)]))
+            self._send("tf", tf_message([placed(frame, pose)]))
 
-    def _send(self, topic: str, kind: str, message: Any, *, latched: bool = False) -> None:
-        self._output.send(topic, kind, serialise(message, kind), latched=latched)
-
-    def _send_of(self, name: str, topic: str, message: Any, *, latched: bool = False) -> None:
-        self._send(f"{BODIES}/{name}/{topic}", OF_BODY[topic], message, latched=latched)
+    def _send(self, topic: str, message: Any, *, latched: bool = False) -> None:
+        self._output.send(topic, message.__msgtype__, serialise(message), latched=latched)

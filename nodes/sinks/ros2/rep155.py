@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import WorldBody
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import PARENTS, J
 
 Links = Mapping[str, tuple[Floats, Floats]]
@@ -78,11 +79,7 @@ def body_name(body_id: int) -> str:
 
 def joint_rotations(body: WorldBody) -> Floats:
     """(22, 3, 3) rotations of the canonical joints in the world."""
-    turned = Rotation.from_quat(body.rotations.astype(np.float64)).as_matrix()
-    for joint, parent in enumerate(PARENTS):
-        if parent >= 0:
-            turned[joint] = turned[parent] @ turned[joint]
-    return turned
+    return global_rotations(Rotation.from_quat(body.rotations.astype(np.float64)).as_matrix())
 
 
 def frames(body: WorldBody) -> Links:
@@ -171,12 +168,7 @@ def measures(body: WorldBody) -> dict[str, Floats]:
 
 
 def urdf(body: str, measured: Mapping[str, Floats]) -> str:
-    """The URDF of one person.
-
-    Args:
-        body: the body's id, the suffix of all names of links and joints.
-        measured: the person's `measures`.
-    """
+    """The URDF of a person with these `measures`; ``body`` is the suffix of all names of links and joints."""
     robot = ElementTree.Element("robot", name=f"human_{body}")
 
     def add(link: str, parent: str, joint: str, axis: tuple[float, float, float] | None, origin: Floats) -> None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
-from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
@@ -56,7 +55,8 @@ class ViewerNode(Node):
         self._images = ImageReader(self.launch.transport.ipc_directory / NAME) if asked else None
         with ViewerServer(settings.port, settings.host) as self._server:
             recording = connect(self._server)
-            self._view = PoseView(recording, flagged_from(self.launch))
+            score = self.launch.settings(PriorSettings).score
+            self._view = PoseView(recording, threshold=-math.log10(score.false_alarms))
             print(f"viewer: {self._server.url}", flush=True)
             if settings.host not in LOCAL_NAMES:
                 print(f"viewer: anyone who listens on the network of {settings.host} can see the people", flush=True)
@@ -78,11 +78,6 @@ class ViewerNode(Node):
 
     def status(self) -> dict[str, str]:
         return {"address": self._server.url.partition("?")[0]}  # without the token, because diagnostics are recorded
-
-
-def flagged_from(launch: Launch) -> float:
-    """The anomaly score above which the prior raises its flag."""
-    return -math.log10(launch.settings(PriorSettings).score.false_alarms)
 
 
 def connect(server: ViewerServer) -> rr.RecordingStream:

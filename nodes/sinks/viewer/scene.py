@@ -75,13 +75,9 @@ class PoseView:
     """
 
     def __init__(self, recording: rr.RecordingStream, threshold: float = math.nan) -> None:
-        """Draw into a recording.
-
-        Args:
-            recording: Rerun's stream of drawings.
-            threshold: anomaly score above which the prior raises its flag; drawn beside the score.
-        """
-        self._recording, self._threshold = recording, threshold
+        """Draw into a recording; ``threshold`` is the anomaly score above which the prior raises its flag."""
+        self._log, self._threshold = recording.log, threshold
+        self._recording = recording
         self._origin_ns: int | None = None
         self._last: dict[str, tuple[int, int]] = {}
         self._eye: Eye | None = None
@@ -284,9 +280,6 @@ class PoseView:
             origin_ns -= last_ns - stamp_ns
         self._last[topic] = stamp_ns, origin_ns
         self._recording.set_time(TIMELINE, duration=np.timedelta64(stamp_ns - origin_ns, "ns"))
-
-    def _log(self, path: str, what: Any) -> None:
-        self._recording.log(path, what)
 
     def _scalar(self, path: str, value: float | NDArray[np.integer]) -> None:
         import rerun as rr

@@ -93,15 +93,7 @@ DRAWINGS = "drawings.rrd"
 
 
 class PageServer:
-    """Serves another server's pages, and the drawings, in threads.
-
-    Args:
-        host: address to serve at.
-        port: port to serve at.
-        origin: the other server, such as ``http://127.0.0.1:40123``.
-        token: first part of the drawings' path.
-        drawings: the drawings to serve.
-    """
+    """Serves the pages of another server, ``origin``, and the drawings at ``/token/drawings.rrd``, in threads."""
 
     def __init__(self, host: str, port: int, origin: str, token: str, drawings: Drawings) -> None:
         names = own_names(host, socket.getfqdn())
@@ -179,11 +171,7 @@ class ViewerServer(Closing):
     """
 
     def __init__(self, port: int, host: str = LOOPBACK) -> None:
-        """Start serving.
-
-        Args:
-            port: port of the page and the drawings.
-            host: address to serve at.
+        """Start serving the page and the drawings.
 
         Raises:
             ViewerError: the port is taken, or Rerun's server does not start.

@@ -30,8 +30,6 @@ from steadypose.msgs.types import (
     PoseWorld,
     WorldBody,
 )
-from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError, check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
@@ -74,11 +72,7 @@ class WebNode(Node):
     """Serves the newest messages to browsers. The pipeline never waits for it."""
 
     name = "web"
-
-    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
-        super().__init__(launch, clock)
-        self._settings = launch.settings(WebSettings)
-        self._server: WebServer | None = None
+    _server: WebServer | None = None
 
     @property
     def url(self) -> str:
@@ -88,7 +82,7 @@ class WebNode(Node):
     def work(self) -> None:
         from steadypose.nodes.sinks.web.server import WebServer  # not needed to read a launch file
 
-        s = self._settings
+        s = self.launch.settings(WebSettings)
         token = s.token or kept_token(self.launch.transport.ipc_directory / TOKEN_FILE)
         self._server = WebServer(s.host, s.port, s.names, token, hello())
         try:
@@ -109,10 +103,8 @@ class WebNode(Node):
             self._server.send(stream, text, replaces=topic != POSE_EVENTS)
 
     def status(self) -> dict[str, str]:
-        if self._server is None:
-            return {}
         server = self._server
-        return {"clients": str(server.clients), "dropped.slow client": str(server.dropped)}
+        return {"clients": str(server.clients), "dropped.slow client": str(server.dropped)} if server else {}
 
 
 def kept_token(file: Path) -> str:
@@ -127,14 +119,13 @@ def kept_token(file: Path) -> str:
 
 
 VERSION = 1
-HELLO = "hello"
 
 
 def hello() -> str:
     """The first message to a client: the names behind the numbers in all other messages."""
     return _text(
         {
-            "topic": HELLO,
+            "topic": "hello",
             "version": VERSION,
             "joints": JOINTS,
             "parents": PARENTS,
@@ -202,16 +193,9 @@ def _event(event: Event) -> dict[str, Any]:
 
 
 def _numbers(values: NDArray[np.floating]) -> list[Any]:
-    rounded = np.round(values.astype(np.float64), 4)
-    if np.isfinite(rounded).all():
-        return rounded.tolist()
-    return _without_nan(rounded.tolist())
-
-
-def _without_nan(values: Any) -> Any:
-    if isinstance(values, list):
-        return [_without_nan(value) for value in values]
-    return values if math.isfinite(values) else None
+    rounded = np.round(values.astype(np.float64), 4).astype(object)
+    rounded[~np.isfinite(values)] = None
+    return rounded.tolist()
 
 
 def _text(value: dict[str, Any]) -> str:

@@ -46,14 +46,9 @@ STREAMS_KEPT = 64
 
 
 class WebServer:
-    """HTTP and WebSocket at one port.
+    """HTTP and WebSocket at one port (0: any free one), for clients that give the token.
 
-    Args:
-        host: address to serve at.
-        port: port to serve at; 0: any free port.
-        names: accepted host names besides ``host`` and this machine's own names.
-        token: token that a client must give.
-        greeting: first message to each client.
+    Requests must call ``host``, this machine's own names, or one of ``names``.
 
     Attributes:
         url: address of the page, with the token.
@@ -85,13 +80,7 @@ class WebServer:
         return len(self._clients)
 
     def send(self, stream: str, text: str, *, replaces: bool) -> None:
-        """Send a message to all clients.
-
-        Args:
-            stream: name of its stream.
-            text: the message as JSON.
-            replaces: whether it replaces an unsent older message of the same stream.
-        """
+        """Send a message as JSON to all clients, and say whether it replaces an unsent older one of its stream."""
         self._loop.call_soon_threadsafe(self._offer, stream, text, replaces)
 
     def close(self) -> None:
