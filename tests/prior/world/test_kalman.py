@@ -118,13 +118,30 @@ def test_a_standing_foot_holds_the_root_and_stops_it():
     assert np.linalg.norm(f.velocity) < 0.1
 
 
-def test_foot_height_tells_only_the_height():
-    f = at_origin(BodyNoise(), jitter=0.5)
-    f.observe_foot(0, np.array([0.0, 0.0, -0.9]), 0.01, 0.0, from_root=True)
-    f.observe_foot_height(0, 0.08, 0.02)
+def test_foot_height_tells_only_the_height_of_root_and_foot():
+    f = BodyFilter(BodyNoise(), np.zeros(3), 0.5, 0.0, np.zeros(3), feet=2)
+    f.observe_foot(1, np.array([0.0, 0.0, -0.9]), 0.01, 0.0, from_root=True)
+    f.observe_foot_height(1, 0.08, 0.02)
     assert f.position[2] == pytest.approx(0.98, abs=0.01)
+    assert f.feet[:, 2] == pytest.approx([0.0, 0.08], abs=0.01)
     assert f.position_sigma[2] < 0.03
     assert (f.position_sigma[:2] > 0.49).all()
+    assert f.placed.tolist() == [False, True]
+    f.lose(1)
+    assert not f.placed.any()
+
+
+@pytest.mark.parametrize(("speed", "slips"), [(0.0, 1.0), (2.0, 2.0)])
+def test_feet_walk_and_the_root_accelerates_more_the_faster_the_root_moves(speed: float, slips: float):
+    load, rest = np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    expected = np.array([0.006 * slips, 0.2 * slips, 4.0]) ** 2
+    np.testing.assert_allclose(BodyNoise().walk(load, rest, speed), expected)
+    assert BodyNoise().density(speed) == pytest.approx((3.0 + speed) ** 2)
+    f = BodyFilter(BodyNoise(), np.zeros(3), 0.01, 0.0, np.array([0.6 * speed, -0.8 * speed, 9.0]), feet=3)
+    for foot in range(3):
+        f.observe_foot(foot, np.zeros(3), 0.01, 0.0, from_root=False)
+    f.predict(DT, load, rest)
+    np.testing.assert_allclose(f.feet_sigma**2, np.tile((0.01**2 + expected * DT)[:, None], (1, 3)))
 
 
 @settings(max_examples=30)

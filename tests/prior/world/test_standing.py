@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from steadypose.prior.world.compose import MOVES, SWAY, SWAYS, VELOCITY_ERROR, standing_velocity
-from steadypose.prior.world.feet import DEADBAND, EASE_S, StillFeet
+from steadypose.prior.world.compose import standing_velocity
+from steadypose.prior.world.feet import StillFeet
 
 DT = 1 / 30
+DEADBAND, EASE_S = 0.5, 0.1
+SWAY, MOVES, SWAYS, VELOCITY_ERROR = 0.015, 0.1, 0.5, 0.3
 SIGMA = np.full(4, 0.01)
 RESTS, SWINGS = np.ones(4), np.zeros(4)
 

@@ -177,11 +177,12 @@ def test_sensor_pose_that_is_none_is_refused():
 
 
 def test_body_without_a_root_waits_for_one():
-    positions = np.full((22, 3), np.nan)
-    pipeline = TrajectoryPipeline(TrajectorySettings())
-    (world,) = pipeline.process(changed(stream()[0], {"positions": positions}))
-    assert world.bodies == []
-    (world,) = pipeline.process(stream()[1])
+    pipeline, known = TrajectoryPipeline(TrajectorySettings()), stream()[0].bodies[0]
+    without = replace(known, id=7, positions=np.full((22, 3), np.nan))
+    (world,) = pipeline.process(replace(stream()[0], bodies=[without, known]))
+    assert [body.id for body in world.bodies] == [known.id]
+    assert pipeline.counters == {"body_without_root": 1}
+    (world,) = pipeline.process(replace(stream()[1], bodies=[replace(known, id=7)]))
     assert len(world.bodies) == 1
 
 

@@ -1,0 +1,141 @@
+"""Bodies as they are published: legs on their bones, the rotations that go with them, deviations and tracking."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
+from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.models.contacts import Contacts
+from steadypose.prior.world.compose import compose, fit_legs, turn_legs
+from steadypose.prior.world.core import BodyEstimate
+from steadypose.prior.world.feet import FeetState
+from steadypose.prior.world.filter import RootState
+from steadypose.prior.world.networks import Stance
+from steadypose.prior.world.observe import BodyObservation
+
+LENGTHS = np.linalg.norm(REST_OFFSETS, axis=1)
+LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "knee", "ankle", "foot")]
+
+
+def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Local rotations (22, 4) and positions (22, 3) of a body somewhere."""
+    turns = Rotation.from_rotvec(0.4 * np.random.default_rng(seed).normal(size=(22, 3)))
+    return turns.as_quat(), forward_kinematics(turns.as_matrix(), REST_OFFSETS, np.array([1.0, 2.0, 0.9]))[0]
+
+
+def lengths(positions: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(positions - positions[list(PARENTS)], axis=1)
+
+
+def test_the_answer_is_the_most_likely_one():
+    """The gradient of the energy, sum of (x - x0)² / s² + (|bone| - length)² / s_l², is all but gone."""
+    rng = np.random.default_rng(2)
+    _, positions = pose(2)
+    sigma = 0.02 * np.exp(0.3 * rng.normal(size=22))
+    seen = positions + 0.01 * rng.normal(size=(22, 3))
+
+    def energy(p: np.ndarray) -> float:
+        bones = [j for j in LEGS if j not in (J["left_hip"], J["right_hip"])]
+        lengths_off = (lengths(p) - LENGTHS)[bones] / 0.025
+        return float((((p - seen) / sigma[:, None]) ** 2).sum() + (lengths_off**2).sum())
+
+    fitted = fit_legs(seen, sigma, LENGTHS)
+    least = min(
+        energy(fitted + 0.0005 * rng.normal(size=(22, 3)) * (np.isin(range(22), LEGS))[:, None]) for _ in range(200)
+    )
+    assert energy(fitted) < energy(seen)
+    assert energy(fitted) < least + 0.01
+
+
+def test_joints_and_lengths_that_are_not_known_are_left_out():
+    _, positions = pose(3)
+    positions[J["left_knee"]] = np.nan
+    fitted = fit_legs(positions + 0.01, np.full(22, 0.02), np.zeros(22))
+    np.testing.assert_array_equal(fitted, positions + 0.01)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rotations_go_with_the_legs(sign: float):
+    """A quaternion and its negative are the same rotation."""
+    rotations, positions = pose(4)
+    rotations *= sign
+    moved = positions.copy()
+    for side in ("left", "right"):
+        moved[J[f"{side}_knee"]] += [0.02, 0.01, 0.0]
+        moved[J[f"{side}_ankle"]] += [0.03, -0.02, 0.01]
+        moved[J[f"{side}_foot"]] += [0.03, 0.0, 0.0]
+    turned = turn_legs(rotations, positions, moved)
+    offsets = REST_OFFSETS * (lengths(moved) / np.maximum(LENGTHS, 1e-9))[:, None]
+    placed = forward_kinematics(Rotation.from_quat(turned).as_matrix(), offsets, moved[0])[0]
+    np.testing.assert_allclose(placed[LEGS], moved[LEGS], atol=1e-9)
+    others = sorted(set(range(22)) - set(LEGS))
+    np.testing.assert_array_equal(turned[others], rotations[others])
+
+
+def test_rotations_that_are_none_are_left_alone():
+    rotations, positions = pose(5)
+    rotations[J["left_knee"]] = np.nan
+    rotations[J["right_ankle"]] = 0.0
+    np.testing.assert_array_equal(turn_legs(rotations, positions, positions + 0.01), rotations)
+
+
+def composed(lost_sigma: float = 0.5, **fields: Any) -> tuple[WorldBody, BodyEstimate]:
+    """A body walking at 2 m/s as published, with heels estimated 5 cm from where they are seen and no toes."""
+    rotations, positions = pose(6)
+    values = {name: np.full(22, 0.01) for name in ("sigma", "joint_anomaly", "bone_lengths", "raw_confidence")}
+    body = CleanBody(
+        id=3, positions=positions, rotations=rotations, state=np.full(22, JointState.SEEN), anomaly=0.0,
+        anomaly_flag=False, raw_positions=positions, **(values | {"bone_lengths": np.zeros(22)}),
+    )  # fmt: skip
+    observed = BodyObservation(
+        body, 0, 1 / 30, positions.copy(), np.array([0.0, 0.0, 0.6, 0.8]), np.ones(22, dtype=bool), np.full(22, 0.01),
+        **({"root_sigma": 0.02, "pelvis_observed": True} | fields),
+    )  # fmt: skip
+    heels = np.full((4, 3), np.nan)
+    heels[:2] = observed.feet[:2] + [0.05, 0.0, 0.0]
+    covariance = np.diag([0.3, 0.4, 0.1, 0.02, 0.02, 0.02]) ** 2
+    root = RootState(
+        np.array([1.0, 2.0, 1.0]), np.array([2.0, 0.0, 0.0]), covariance, heels, np.full((4, 3), 0.02),
+        np.array([0.1, 0.2, 0.3]),
+    )  # fmt: skip
+    ramp = np.linspace(0, 1, 8, dtype=np.float32)
+    contacts = Contacts(ramp, ramp[::-1], ramp[:1])
+    rest = np.array([0.9, 0.0, 0.0, 0.8])
+    estimate = BodyEstimate(observed, None, contacts, Stance(rest, rest), root, FeetState(heels, np.full(4, 0.03)))
+    return compose(estimate, lost_sigma), estimate
+
+
+@pytest.mark.parametrize("root_sigma", [0.02, np.inf])
+def test_joints_are_published_where_and_as_surely_as_root_and_feet_are_estimated(root_sigma: float) -> None:
+    body, estimate = composed(root_sigma=root_sigma)
+    spread = np.sqrt((0.3**2 + 0.4**2 + 0.1**2) / 3)
+    places, sigma = (
+        estimate.observed.positions + [0.1, 0.2, 0.3],
+        np.full(22, 0.01 if root_sigma < 1.0 else np.hypot(0.01, spread)),
+    )
+    places[0], sigma[0] = [1.0, 2.0, 1.0], spread
+    heels = [J["left_ankle"], J["right_ankle"]]
+    places[heels], sigma[heels] = estimate.feet.positions[:2], 0.03
+    np.testing.assert_allclose(body.positions, places, atol=1e-6)
+    np.testing.assert_allclose(body.sigma, sigma, rtol=1e-6)
+    np.testing.assert_allclose(body.rotations[0], [0.0, 0.0, 0.6, 0.8], atol=1e-6)
+    np.testing.assert_allclose(body.contacts, np.linspace(0, 1, 8), atol=1e-6)
+    assert (body.state == JointState.SEEN).all()
+
+
+@pytest.mark.parametrize(("lost_sigma", "lost"), [(0.51, False), (0.49, True)])
+def test_a_body_is_lost_beyond_a_horizontal_deviation(lost_sigma: float, lost: bool) -> None:
+    assert composed(lost_sigma)[0].tracking == (Tracking.LOST if lost else Tracking.OK)
+    assert composed(lost_sigma, root_sigma=np.inf)[0].tracking == (Tracking.LOST if lost else Tracking.COASTING)
+
+
+@pytest.mark.parametrize(("pelvis", "share"), [(True, 0.6), (False, 1.0)])
+def test_a_velocity_is_surer_than_the_filter_states_where_the_pelvis_is_observed(pelvis: bool, share: float) -> None:
+    body, _ = composed(pelvis_observed=pelvis)
+    np.testing.assert_allclose(np.sqrt(np.diag(body.covariance)), [0.3, 0.4, 0.1, *[0.02 * share] * 3], rtol=1e-6)

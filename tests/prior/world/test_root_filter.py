@@ -1,0 +1,168 @@
+"""Which observations and predictions the filter of root and feet uses, and how much it trusts each."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from steadypose.prior.body.skeleton import REST_POSITIONS, limbs
+from steadypose.prior.world.filter import RootFilter
+from steadypose.prior.world.floor import Floor
+from steadypose.prior.world.kalman import BodyFilter, BodyNoise
+from steadypose.prior.world.networks import RootVelocity, Stance
+from steadypose.prior.world.observe import FEET, BodyObservation
+
+DT = 1 / 30
+LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
+SWINGS = Stance(np.zeros(4), np.zeros(4))
+STILL = RootVelocity(np.zeros(3), np.full(3, 0.1))
+SOLES = np.array([0.07, 0.07, 0.022, 0.022])
+HIDDEN = np.inf
+
+
+def seen(
+    root: Any, dt: float = DT, *, sigma: float = 0.02, root_sigma: float | None = None, legs: float = 1.0
+) -> BodyObservation:
+    """A body in the rest pose, of which a share of the legs is observed."""
+    positions = REST_POSITIONS - REST_POSITIONS[0] + root
+    observed = np.ones(22, dtype=bool)
+    observed[LEGS] = np.arange(len(LEGS)) < legs * len(LEGS)
+    sigmas = np.full(22, sigma)
+    return BodyObservation(
+        cast(Any, None), 0, dt, positions, np.array([0.0, 0.0, 0.0, 1.0]), observed, sigmas,
+        sigma if root_sigma is None else root_sigma, True,
+    )  # fmt: skip
+
+
+def split(sigma: Any) -> tuple[Any, Any]:
+    """Standard deviations of an error's independent and of its slow part."""
+    return 0.3 * sigma, np.sqrt(0.91) * sigma
+
+
+@pytest.mark.parametrize(
+    ("root", "root_sigma", "legs", "inferred"),
+    [(0.0, None, 1.0, 0.0), (0.0, None, 0.5, 0.5), (0.0, HIDDEN, 0.0, 1.0), (np.nan, HIDDEN, 1.0, 1.0)],
+)
+def test_a_first_velocity_is_the_networks_as_far_as_the_legs_are_observed(root, root_sigma, legs, inferred) -> None:
+    ours = RootFilter(seen(np.zeros(3), 0.0, root_sigma=root_sigma), BodyNoise(first_speed=1.0))
+    walks = RootVelocity(np.array([1.0, 0.0, 0.0]), np.full(3, 0.2))
+    state = ours.update(seen(np.full(3, root), 0.0, root_sigma=root_sigma, legs=legs), walks, SWINGS, Floor(True))
+    np.testing.assert_allclose(state.velocity, [1 / (1 + 0.2**2 + (0.5 * inferred) ** 2), 0, 0], atol=1e-9)
+
+
+def test_it_is_a_kalman_filter_of_what_is_seen_and_of_standing_feet_while_the_root_is_hidden() -> None:
+    rng, floor, noise = np.random.default_rng(0), Floor(calibrated=True), BodyNoise()
+    for _ in range(30):  # a step on which the body stands at the edge: it ends 40 cm from where feet have been
+        floor.observe(np.array([0.0, 0.0, 0.3]), 0.02, DT)
+    edge = np.array([0.39, 0.0, 1.25]) - [REST_POSITIONS[FEET[2], 0] - REST_POSITIONS[0, 0], 0.0, 0.0]
+    roots = edge + 0.01 * rng.normal(size=(24, 3)) * [0.0, 1.0, 1.0]
+    ours = RootFilter(seen(roots[0], 0.0), noise)
+    theirs = BodyFilter(noise, roots[0], *split(0.02), np.zeros(3), 4)
+    off, raised, shift = np.zeros(3), 0, np.zeros(3)
+    for t, root in enumerate(roots):
+        hidden, dt = t >= 12, DT if t else 0.0
+        now = seen(root, dt, root_sigma=HIDDEN if hidden else None)
+        network = RootVelocity(0.2 * rng.normal(size=3), rng.uniform(0.05, 0.2, 3))
+        stance = Stance(np.array([1.0, 0.8, 0.8, 0.3]), np.array([0.9, 0.4, 0.6, 0.0]))
+        state = ours.update(now, network, stance, floor)
+        if t:
+            theirs.predict(dt, *stance)
+        if t and not hidden:
+            off += (1 - np.exp(-DT / 0.5)) * ((root - roots[t - 1]) / DT - network.velocity - off)
+        sigma = network.sigma if hidden else np.hypot(network.sigma, np.linalg.norm(off))
+        theirs.observe_velocity(network.velocity, *split(sigma))
+        if not hidden:
+            theirs.observe_position(root, *split(0.02))
+        for foot, place in enumerate(now.feet):
+            theirs.observe_foot(foot, place - hidden * root, *split(0.02), from_root=hidden)
+        for foot in (0, 2):
+            under = floor.under(theirs.feet[foot] - [0.0, 0.0, SOLES[foot]])
+            if hidden and np.isfinite(under):
+                raised += 1
+                theirs.observe_foot_height(foot, under + SOLES[foot], np.hypot(floor.sigma, 0.02))
+        np.testing.assert_allclose(state.position, theirs.position, atol=1e-9)
+        np.testing.assert_allclose(state.velocity, theirs.velocity, atol=1e-9)
+        np.testing.assert_allclose(state.covariance, theirs.covariance, atol=1e-9)
+        np.testing.assert_allclose(state.feet, theirs.feet, atol=1e-9)
+        shift = hidden * (theirs.position - root)
+        np.testing.assert_allclose(state.shift, shift, atol=1e-9)
+    assert raised > 12
+    for later in range(1, 4):
+        after = ours.update(seen(roots[-1]), STILL, SWINGS, floor)
+        np.testing.assert_allclose(after.shift, shift * np.exp(-later * DT / 0.1), atol=1e-9)
+
+
+def settled(sigma: float = 0.02) -> RootFilter:
+    """The filter of a body that has stood at the origin for a second."""
+    ours = RootFilter(seen(np.zeros(3), 0.0, sigma=sigma), BodyNoise())
+    for t in range(30):
+        ours.update(seen(np.zeros(3), DT if t else 0.0, sigma=sigma), STILL, SWINGS, Floor(True))
+    return ours
+
+
+def places(ours: RootFilter, at: float, frames: int, sigma: float = 0.02) -> NDArray[np.float64]:
+    """Where the root is estimated, along the axis along which it has jumped."""
+    states = [
+        ours.update(seen(np.array([0.0, at, 0.0]), sigma=sigma), STILL, SWINGS, Floor(True)) for _ in range(frames)
+    ]
+    return np.array([state.position[1] for state in states])
+
+
+def test_a_root_that_jumps_by_more_than_thirty_centimetres_is_believed_in_its_sixth_frame() -> None:
+    assert places(settled(), 0.28, 1)[0] > 0.01
+    assert abs(places(settled(), 0.32, 1)[0]) < 0.01
+    found = places(settled(), 5.0, 6)
+    assert np.abs(found[:5]).max() < 0.01
+    assert found[5] == 5.0
+
+
+def test_a_root_that_is_known_badly_may_jump_by_five_standard_deviations() -> None:
+    spread = float(settled(0.2).update(seen(np.zeros(3), sigma=0.2), STILL, SWINGS, Floor(True)).position_sigma[1])
+    gate = 5 * np.hypot(spread, 0.2)
+    assert places(settled(0.2), 0.9 * gate, 1, 0.2)[0] > 0.05
+    assert abs(places(settled(0.2), 1.2 * gate, 1, 0.2)[0]) < 0.05
+
+
+def test_a_root_that_comes_back_elsewhere_is_believed_at_once_and_keeps_its_velocity() -> None:
+    ours = settled()
+    walks = RootVelocity(np.array([1.0, 0.0, 0.0]), np.full(3, 0.05))
+    before = [ours.update(seen(np.zeros(3), root_sigma=HIDDEN), walks, SWINGS, Floor(True)) for _ in range(15)][-1]
+    assert before.velocity[0] > 0.8
+    after = ours.update(seen(np.array([3.0, 0.0, 0.0])), None, SWINGS, Floor(True))
+    assert after.position[0] == 3.0
+    assert after.velocity[0] == pytest.approx(before.velocity[0])
+
+
+def test_a_network_at_odds_with_the_root_is_not_used_until_it_agrees_to_thirty_centimetres_a_second() -> None:
+    ours, wrong = settled(), RootVelocity(np.array([1.0, 0.0, 0.0]), np.full(3, 0.1))
+
+    def used(network: RootVelocity) -> bool:
+        tried = [deepcopy(ours).update(seen(np.zeros(3)), say, SWINGS, Floor(True)) for say in (network, None)]
+        return not np.allclose(tried[0].covariance, tried[1].covariance)
+
+    assert used(wrong)
+    ours.update(seen(np.array([0.0, 5.0, 0.0])), wrong, SWINGS, Floor(True))
+    assert not used(STILL)  # the root may be elsewhere
+    state = [ours.update(seen(np.zeros(3)), wrong, SWINGS, Floor(True)) for _ in range(60)][-1]
+    close = [wrong._replace(velocity=state.velocity + [0.0, off, 9.0]) for off in (-0.35, -0.25, 0.25, 0.35)]
+    assert [used(network) for network in close] == [False, True, True, False]
+
+
+def test_after_a_gap_feet_stand_anew() -> None:
+    for dt, stands in ((0.29, True), (0.31, False)):
+        ours = settled()
+        moved = seen(np.array([0.2, 0.0, 0.0]), dt, sigma=0.1)
+        rests = Stance(np.ones(4), np.ones(4))
+        state = ours.update(moved, STILL, rests, Floor(True))
+        assert np.allclose(state.feet[:, 0], moved.feet[:, 0]) != stands
+
+
+def test_feet_that_are_not_known_have_no_place() -> None:
+    ours, now = settled(), seen(np.zeros(3))
+    now.positions[FEET[1]] = np.nan
+    now.sigma[FEET[2]] = np.inf
+    assert np.isnan(ours.update(now, STILL, SWINGS, Floor(True)).feet[:, 0]).tolist() == [False, True, True, False]
