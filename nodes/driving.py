@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.types import Message, PoseClean, PoseRaw
+from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.checks.stamps import check_length
 from steadypose.nodes.checks.stream import StreamCheck
@@ -23,6 +23,8 @@ from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.events.detector import NOWHERE
+from steadypose.prior.events.timeline import EventTimeline
 
 if TYPE_CHECKING:
     from steadypose.prior.clean.pipeline import PriorPipeline
@@ -105,6 +107,7 @@ class OfflineRun:
     Args:
         source: the recording.
         settings: ``[prior]`` and ``[trajectory]`` of a launch file.
+        timeline: collects the events, if given.
 
     Attributes:
         diagnosis: problems of the input.
@@ -114,20 +117,21 @@ class OfflineRun:
         LaunchError: a setting is unknown, or its value is invalid.
     """
 
-    def __init__(self, source: RecordedSource, settings: Settings) -> None:
+    def __init__(self, source: RecordedSource, settings: Settings, timeline: EventTimeline | None = None) -> None:
         # imported late, because these imports compile loops
         from steadypose.nodes.graph.prior_node import make_prior
         from steadypose.nodes.graph.threads import one_thread
         from steadypose.nodes.graph.trajectory_node import make_trajectory
 
         one_thread()
-        self._source = source
+        self._source, self._timeline = source, timeline
         self._prior, self._trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
         self._stamps_ns: list[int] = []
         self.diagnosis = Diagnosis(PriorSettings.from_dict(settings["prior"]))
         self.poses = 0
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
+        sensor = NOWHERE
         for topic, message in stream(self._source, self._prior, self._trajectory):
             if isinstance(message, PoseRaw) and not message.end_of_stream:
                 self._stamps_ns.append(message.stamp_ns)
@@ -136,6 +140,9 @@ class OfflineRun:
                     self.diagnosis.look()
             elif isinstance(message, PoseClean):
                 self.poses += len(message.bodies)
+                sensor = message.sensor_pose.position
+            elif self._timeline and topic == POSE_WORLD and isinstance(message, PoseWorld):
+                self._timeline.add(message, sensor)
             yield topic, message
         self.diagnosis.end()
 

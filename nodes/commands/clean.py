@@ -12,6 +12,7 @@ from steadypose.nodes.commands.output import (
     File,
     In,
     Out,
+    check_file,
     check_format,
     check_output,
     clean_recording,
@@ -32,6 +33,7 @@ def clean(
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="STAGE.OPTION=VALUE")] = (),
     skeletons: File = None,
     rig: File = None,
+    events: File = None,
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     ray: bool = False,
     force: bool = False,
@@ -48,18 +50,19 @@ def clean(
             motion capture (.bvh, .trc, .c3d, AMASS .npz, .npy); a video; or a folder of these, with subfolders.
         out: the result: a recording, or an .npz or .csv with one row per input row; or a folder.
         delay: frames at 30 Hz that the output lags behind, 0 to 16; more is more accurate. Default 4.
-        settings: override a setting of [prior] or [trajectory], such as gate.enabled=false or
+        settings: override a setting of [prior], [trajectory] or [events], such as gate.enabled=false or
             trajectory.contacts=false. A unique end of its name is enough. Repeatable. To use weights that you trained,
             set smooth.weights, reconstruct.weights or trajectory.weights to their name or .safetensors file.
         skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
         rig: TOML file that describes motion capture which is not recognised: metres (length of its unit), up, fps,
             skeleton (of arrays), and [canonical], its names of the joints of smpl22.
+        events: .csv to write what the people do to: a row an event, with its begin and end (docs/events.md).
         jobs: for a folder, how many recordings to clean at once. Each takes about 1 GB of memory. Default: the
             number of cores.
         ray: clean a folder on a Ray cluster: the one of this machine or of RAY_ADDRESS, or else a new local one. All
             its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
-        force: replace OUT if it is a recording, an .npz or a .csv. In a folder, results of earlier calls are always
-            replaced, and other files never.
+        force: replace OUT if it is a recording, an .npz or a .csv, and the .csv of --events. In a folder, results of
+            earlier calls are always replaced, and other files never.
     """
     table: dict[str, Any] = {"prior": {}, "trajectory": {}}
     if delay is not None:
@@ -74,9 +77,15 @@ def clean(
         table["rig"] = read_toml(rig)
     check_format(out)
     check_output(source, out)
+    if events is not None:
+        check_file(source, events, (".csv",), replace=force)
+        if events.resolve() == out.resolve():
+            raise LaunchError(f"--events {events}: expected another path than OUT's")
     terminal = console()
     compile_missing(lambda line: terminal.print(printable(line)))
     if is_folder_of_recordings(source):
+        if events is not None:
+            raise LaunchError(f"--events: expected a single recording as IN; {source} is a folder of them")
         return clean_folder(source, out, table, jobs, ray, terminal)
     if ray or jobs is not None:
         raise LaunchError(f"--{'ray' if ray else 'jobs'}: expected a folder of recordings as IN; {source} is one alone")
@@ -86,6 +95,7 @@ def clean(
             source,
             out,
             table,
+            events=events,
             replace=force,
             began=lambda frames: progress.update(bar, total=frames),
             advanced=lambda: progress.advance(bar),

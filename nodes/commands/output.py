@@ -23,10 +23,13 @@ from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.arrays import NpzCollector, write_csv
+from steadypose.nodes.sinks.arrays import NpzCollector, write_csv, write_events
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import add_layouts
+from steadypose.prior.events.detector import EventSettings
+from steadypose.prior.events.timeline import EventTimeline
+from steadypose.prior.settings import build_settings
 
 In = Annotated[Path, tyro.conf.arg(name="in", metavar="IN")]
 Out = Annotated[Path, tyro.conf.arg(metavar="OUT")]
@@ -182,6 +185,7 @@ def clean_recording(
     out: Path,
     settings: Mapping[str, Mapping[str, Any]],
     *,
+    events: Path | None = None,
     replace: bool = False,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[], None] = lambda: None,
@@ -191,8 +195,9 @@ def clean_recording(
     Args:
         source: a recording or file of poses.
         out: the recording to make, or .npz or .csv.
-        settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` of a launch file; ``rig`` is what a
-            file of motion does not say.
+        settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` and ``[events]`` of a launch file;
+            ``rig`` is what a file of motion does not say.
+        events: .csv to write the events to as well.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames.
         advanced: called after each.
@@ -205,7 +210,8 @@ def clean_recording(
     check_replaceable(out, replace=replace, is_file=out.suffix in ARRAY_FILES)
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source, settings.get("rig", {}))
-    run = OfflineRun(frames, settings)
+    timeline = EventTimeline(build_settings(EventSettings, settings.get("events", {}), "events")) if events else None
+    run = OfflineRun(frames, settings, timeline)
     began(len(frames))
     started = time.perf_counter()
 
@@ -218,6 +224,10 @@ def clean_recording(
             raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
 
     write_output(out, lambda: NpzCollector(messages()).arrays(run.stamps_ns), messages)
+    if events and timeline:
+        with unfinished(events) as part:
+            write_events(part, timeline.events())
+            part.replace(events)
     return Cleaned(
         frames=len(run.stamps_ns),
         duration_s=float(np.ptp(run.stamps_ns)) / 1e9,

@@ -217,8 +217,8 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     table[key] = value
 
 
-PIPELINES = ("prior", "trajectory")
-"""Sections of the two pipelines that `clean` runs."""
+PIPELINES = ("prior", "trajectory", "events")
+"""Sections of what `clean` runs."""
 
 _SECTIONS_OF_ALL = {
     "transport": "steadypose.nodes.graph.topology:TransportSettings",
@@ -257,18 +257,18 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
 
 
 def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check the settings of both pipelines without loading them.
+    """Check the settings of `PIPELINES` without loading them.
 
     Raises:
         LaunchError: a setting does not exist, its value is invalid, or there are no such weights.
     """
     with launch_errors():
         for section, kind in pipeline_sections().items():
-            check_weights(kind.from_dict(settings.get(section, {})))
+            check_weights(build_settings(kind, current_keys(section, settings.get(section, {})), section))
 
 
 def check_weights_of(launch: Launch) -> None:
-    """Check, before nodes start, that the weights of both pipelines exist.
+    """Check, before nodes start, that the weights of `PIPELINES` exist.
 
     Raises:
         LaunchError: there are no such weights.
@@ -279,7 +279,7 @@ def check_weights_of(launch: Launch) -> None:
 
 
 def pipeline_sections() -> dict[str, type]:
-    """Settings dataclasses of the two pipelines that `clean` runs, by section."""
+    """Settings dataclasses of `PIPELINES`, by section."""
     return {section: load(NODES[section].settings) for section in PIPELINES}
 
 

@@ -20,14 +20,16 @@ from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.launch import check_settings
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.library.poses import Poses
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import LaunchError, launch_errors
 from steadypose.nodes.sinks.plot.figure import draw, save
 from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_path
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.body.layouts import CANONICAL, add_layouts
-from steadypose.prior.settings import nearest
+from steadypose.prior.events.detector import EventSettings
+from steadypose.prior.events.timeline import EventTimeline
+from steadypose.prior.settings import build_settings, nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,7 +182,7 @@ def clean(
         confidence: (T, J) or (T, B, J) 0 to 1, if the source provides it.
         up: the axis of the positions that points up: ``z`` (default), ``y`` or ``-y``.
         delay: delay of the output, 0 to 16 frames at 30 Hz; more is smoother.
-        settings: ``prior`` and ``trajectory`` as in a launch file; they take precedence over ``delay``.
+        settings: ``prior``, ``trajectory`` and ``events`` as in a launch file; they take precedence over ``delay``.
 
     Returns:
         The arrays of ``steadypose clean``'s ``.npz``, one row per input frame, as a dictionary and as attributes. They
@@ -188,7 +190,7 @@ def clean(
         (T, 22) `JointState`, ``sigma`` (T, 22) metres, ``anomaly`` and ``anomaly_flag`` (T,), ``joint_anomaly``
         (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s, ``world_positions`` (T, 22, 3) metres, z up (the
         attribute ``world``), and ``joint_names`` (22,). For several bodies, an axis B follows time, and ``body_id``
-        (B,) lists the recognised bodies.
+        (B,) lists the recognised bodies. ``events`` lists what the people do, with begin and end.
 
     Raises:
         ValueError: an array has the wrong form, or neither fps nor stamp_ns is given. The text says what was expected.
@@ -197,13 +199,16 @@ def clean(
         InputWarning: units, axes or joint order are probably wrong. The texts are also in ``problems``.
     """
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    checked = sections(settings, delay)
+    pipelines = dict(settings or {})
+    with launch_errors():
+        timeline = EventTimeline(build_settings(EventSettings, pipelines.pop("events", {}), "events"))
+    checked = sections(pipelines, delay)
     compile_loops()
-    run = OfflineRun(source, checked)
+    run = OfflineRun(source, checked, timeline)
     arrays = run.arrays()
     problems = run.diagnosis.texts or ([] if run.poses else [NOBODY])
     warn(problems)
-    return Poses(arrays, problems, run.refused)
+    return Poses(arrays, problems, run.refused, timeline.events())
 
 
 def complete(

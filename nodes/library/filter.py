@@ -35,7 +35,7 @@ class FilterError(ValueError):
 
 
 class Filter:
-    """Cleans joints live: ``pose = filter(joints, t)``. The result is the same as that of the nodes.
+    """Cleans joints live: ``pose = cleaner(joints, t)``. The result is the same as that of the nodes.
 
     Use one filter per camera, from one thread. It handles all bodies in view. The same input always gives the same
     output. Poses are at 30 Hz, ``delay`` frames behind the input. The stream restarts if stamps go back, or pause for
@@ -206,7 +206,7 @@ class Filter:
 def _stamp(t: float | None, stamp_ns: int | None) -> int:
     """Nanoseconds of capture."""
     if (t is None) == (stamp_ns is None):
-        raise FilterError("expected the time of capture: t in seconds, or stamp_ns; filter(joints, time.time())")
+        raise FilterError("expected the time of capture: t in seconds, or stamp_ns; cleaner(joints, time.time())")
     if stamp_ns is not None:
         return int(stamp_ns)
     if not math.isfinite(t) or t < 0:  # type: ignore[operator]  (one of the two is given)

@@ -18,6 +18,7 @@ from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.sinks.drawing import to_world
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.events.timeline import TimedEvent
 from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class Poses(dict[str, NDArray[Any]]):
     Attributes:
         problems: probable faults of the input, as text, with the remedy.
         refused: counts of unused frames, bodies and joints, by cause.
+        events: what the people do, each event once, by begin. Only `clean` gives it.
     """
 
     def __init__(
@@ -82,8 +84,10 @@ class Poses(dict[str, NDArray[Any]]):
         arrays: Mapping[str, NDArray[Any]],
         problems: Iterable[str] = (),
         refused: Mapping[str, int] | None = None,
+        events: Iterable[TimedEvent] = (),
     ) -> None:
         super().__init__(arrays)
+        self.events: tuple[TimedEvent, ...] = tuple(events)
         self.problems: tuple[str, ...] = tuple(problems)
         self.refused: dict[str, int] = dict(refused or {})
 
@@ -160,10 +164,11 @@ class Poses(dict[str, NDArray[Any]]):
         axis = self["stamp_ns"].ndim
         common = {name: self[name] for name in self if name in ALWAYS[:2]}
         own = [name for name in self if name not in ALWAYS]
-        return {
-            int(id): Poses(common | {name: self[name].take(row, axis) for name in own}, self.problems, self.refused)
-            for row, id in enumerate(self["body_id"])
-        }
+        bodies = {}
+        for row, id in enumerate(self["body_id"].tolist()):
+            arrays = common | {name: self[name].take(row, axis) for name in own}
+            bodies[id] = Poses(arrays, self.problems, self.refused, (e for e in self.events if e.body == id))
+        return bodies
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
         """Plain arrays by name, as in the ``.npz``."""

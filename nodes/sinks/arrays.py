@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import JOINTS, JointState, Message, PoseClean, PoseWorld
+from steadypose.msgs.types import JOINTS, EventKind, JointState, Message, PoseClean, PoseWorld
 from steadypose.nodes.graph.clock import FRAME_NS
+from steadypose.prior.events.timeline import TimedEvent
 
 SLACK_NS = 1_000_000
 """Tolerance added to the frame period over which a grid row's values are held, nanoseconds."""
@@ -162,12 +163,30 @@ def _rows(arrays: Mapping[str, NDArray[Any]], several: bool) -> Iterator[list[st
         for body, number in enumerate(ids):
             if several and np.isnan(joints[row, body]).all():
                 continue  # absent bodies have no row
-            cells = [f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}", *([str(number)] if several else [])]
+            cells = [_seconds(stamp_ns), *([str(number)] if several else [])]
             for joint in range(len(JOINTS)):
                 at = row, body, joint
                 cells += [_cell(value, 5) for value in joints[at].tolist()]
                 cells += [str(observed[at]), str(state[at]), _cell(float(sigma[at]), 5)]
             yield [*cells, _cell(float(anomaly[row, body]), 3), str(int(flag[row, body]))]
+
+
+def write_events(path: Path, events: Iterable[TimedEvent]) -> None:
+    """Write events as CSV: a row each, with its begin and end in seconds."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["body", "event", "hand", "begin", "end", "confidence", *(f"direction_{axis}" for axis in "xyz")]
+        )
+        for event in events:
+            hand = event.hand.name if event.hand else ""
+            times = [_seconds(event.begin_ns), _seconds(event.end_ns)]
+            direction = [_cell(x, 3) if event.kind == EventKind.POINTS else "" for x in event.direction.tolist()]
+            writer.writerow([event.body, event.kind.name, hand, *times, _cell(event.confidence, 3), *direction])
+
+
+def _seconds(stamp_ns: int) -> str:
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def _cell(value: float, digits: int) -> str:

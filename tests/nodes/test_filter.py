@@ -32,9 +32,9 @@ def joints() -> np.ndarray:
 
 
 def frame_by_frame(joints: np.ndarray, **more) -> list[Poses]:
-    filter = steadypose.Filter(delay=DELAY)
-    found = [pose for frame, ns in zip(joints, STAMPS, strict=True) if (pose := filter(frame, stamp_ns=ns, **more))]
-    return found + filter.flush()
+    cleaner = steadypose.Filter(delay=DELAY)
+    found = [pose for frame, ns in zip(joints, STAMPS, strict=True) if (pose := cleaner(frame, stamp_ns=ns, **more))]
+    return found + cleaner.flush()
 
 
 def test_it_gives_what_the_nodes_publish_and_what_clean_gives(joints: np.ndarray) -> None:
@@ -60,12 +60,12 @@ def test_it_gives_what_the_nodes_publish_and_what_clean_gives(joints: np.ndarray
 
 
 def test_none_until_the_delay_is_full_and_while_nobody_is_there(joints: np.ndarray) -> None:
-    filter = steadypose.Filter(delay=3)
-    found = [filter(frame, k / 30) for k, frame in enumerate(joints[:10, 0])]
+    cleaner = steadypose.Filter(delay=3)
+    found = [cleaner(frame, k / 30) for k, frame in enumerate(joints[:10, 0])]
     assert [pose is None for pose in found] == [True] * 3 + [False] * 7
-    assert len(filter.flush()) == 3
-    assert filter.flush() == []
-    left = [filter(frame if k < 20 else [], 1 + k / 30) for k, frame in enumerate(joints[:24, 0])]
+    assert len(cleaner.flush()) == 3
+    assert cleaner.flush() == []
+    left = [cleaner(frame if k < 20 else [], 1 + k / 30) for k, frame in enumerate(joints[:24, 0])]
     assert left[20]["positions"].shape == (22, 3), "of the form of those who were there"  # type: ignore[index]
     empty = steadypose.Filter()
     assert [empty([], k / 30) for k in range(10)] == [None] * 10
@@ -108,9 +108,9 @@ def test_of_many_moments_the_names_are_of_joints_still() -> None:
 
 
 def test_a_slow_camera_completes_several_at_a_call(joints: np.ndarray) -> None:
-    filter = steadypose.Filter(delay=0)
-    found = [filter.update(frame, k / 15) for k, frame in enumerate(joints[:10, 0])]
-    assert sum(map(len, found)) + len(filter.flush()) == 19
+    cleaner = steadypose.Filter(delay=0)
+    found = [cleaner.update(frame, k / 15) for k, frame in enumerate(joints[:10, 0])]
+    assert sum(map(len, found)) + len(cleaner.flush()) == 19
     assert max(map(len, found)) == 2
 
 
@@ -129,31 +129,31 @@ def test_a_layout_of_ones_own(joints: np.ndarray) -> None:
 
 
 def test_what_is_probably_wrong_is_warned_of_once(joints: np.ndarray) -> None:
-    filter = steadypose.Filter()
+    cleaner = steadypose.Filter()
 
     def misuse() -> None:
         for k in range(40):
-            filter(1000 * joints[k % FRAMES, 0], k / 30)
-        filter.flush()
+            cleaner(1000 * joints[k % FRAMES, 0], k / 30)
+        cleaner.flush()
 
     with pytest.warns(steadypose.InputWarning, match="divide by 1000") as caught:
         misuse()
     assert [str(warning.message).split(":")[0] for warning in caught].count("unit") == 1
-    assert any("millimetres" in problem for problem in filter.problems)
+    assert any("millimetres" in problem for problem in cleaner.problems)
 
 
 def test_a_frame_that_cannot_be_used_leaves_the_stream_as_it_was(joints: np.ndarray) -> None:
     alone = joints[:, 0]
-    filter = steadypose.Filter(delay=DELAY)
+    cleaner = steadypose.Filter(delay=DELAY)
     found = []
     for k, (frame, ns) in enumerate(zip(alone, STAMPS, strict=True)):
         if k == 15:
             with pytest.raises(ValueError, match=r"expected \(22, 3\) metres"):
-                filter(frame[:17], stamp_ns=ns)
+                cleaner(frame[:17], stamp_ns=ns)
             with pytest.raises(ValueError, match="different numbers, one a body"):
-                filter(joints[k], stamp_ns=ns, ids=[1, 1])
-        found += filter.update(frame, stamp_ns=ns)
-    found += filter.flush()
+                cleaner(joints[k], stamp_ns=ns, ids=[1, 1])
+        found += cleaner.update(frame, stamp_ns=ns)
+    found += cleaner.flush()
     expected = frame_by_frame(alone)
     assert len(found) == len(expected)
     np.testing.assert_array_equal(found[-1]["positions"], expected[-1]["positions"])
@@ -161,8 +161,8 @@ def test_a_frame_that_cannot_be_used_leaves_the_stream_as_it_was(joints: np.ndar
 
 def test_a_camera_that_moves_says_where_it_is(joints: np.ndarray) -> None:
     place = steadypose.Pose(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    filter = steadypose.Filter(delay=0, sensor_pose=place)
-    pose = [filter(frame, k / 30) for k, frame in enumerate(joints[:20, 0])][-1]
+    cleaner = steadypose.Filter(delay=0, sensor_pose=place)
+    pose = [cleaner(frame, k / 30) for k, frame in enumerate(joints[:20, 0])][-1]
     assert pose is not None
     np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
@@ -24,11 +25,18 @@ def test_it_gives_what_the_command_writes(tmp_path: Path) -> None:
     joints[20:30, 21] = np.nan
     write_npz(tmp_path / "in.npz", joints, fps=25.0)
     clean_recording(tmp_path / "in.npz", tmp_path / "out.npz", {"prior": {"delay": 2}, "trajectory": {}})
-    given = steadypose.clean(joints, fps=25.0, delay=2)
+    given = steadypose.clean(joints, fps=25.0, delay=2, settings={"events": {"near": 10.0}})
     with np.load(tmp_path / "out.npz") as written:
         assert set(given) == set(written)
         for name in given:
             np.testing.assert_array_equal(given[name], written[name], err_msg=name)
+    options = ["--force", "--delay", "2", "--set", "events.near=10", "--events", str(tmp_path / "events.csv")]
+    assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), *options]) == 0
+    rows = list(csv.DictReader((tmp_path / "events.csv").open()))
+    assert {"ENTERED", "STANDS", "NEAR"} <= {row["event"] for row in rows}
+    assert [row["event"] for row in rows] == [event.kind.name for event in given.events]
+    assert [float(row["end"]) for row in rows] == pytest.approx([event.end_ns / 1e9 for event in given.events])
+    assert given.bodies[0].events == given.events
 
 
 def test_several_bodies() -> None:

@@ -39,9 +39,9 @@ def with_none(joints: np.ndarray) -> Any:
 
 
 def frame_by_frame(joints: np.ndarray, times: np.ndarray) -> None:
-    filter = steadypose.Filter()
+    cleaner = steadypose.Filter()
     for frame, t in zip(joints, times - times[0], strict=True):
-        filter(frame, t)
+        cleaner(frame, t)
 
 
 REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
@@ -183,6 +183,16 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         ["export", "in.csv", "out.bvh"],
         {"in.csv": ""},
         "clean it first: steadypose clean in.csv in.npz",
+    ),
+    "events to be written to something else than a table": (
+        ["clean", "in.csv", "out.npz", "--events", "events.json"],
+        {"in.csv": ""},
+        "events.json: expected a name ending in .csv",
+    ),
+    "events of a folder": (
+        ["clean", ".", "../out", "--events", "../events.csv"],
+        {"in.csv": ""},
+        "--events: expected a single recording as IN",
     ),
     "a command that there is not": (["claen"], {}, "did you mean 'clean'?"),
 }
