@@ -1,60 +1,106 @@
-"""Motion capture of a leg, in files as small as can be: what readers are tried on, whole and damaged."""
+"""Motion capture of a leg or an arm, in files as small as can be: what readers are tried on, whole and damaged."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-BVH = """HIERARCHY
-ROOT Hips
-{
- OFFSET 0 0 0
- CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
- JOINT Leg
- {
-  OFFSET 0 -1 0
-  CHANNELS 3 Zrotation Xrotation Yrotation
-  End Site
-  {
-   OFFSET 0 -1 0
-  }
- }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0333333
-0 1 0 0 0 0 10 0 0
-0 1 0 0 0 5 20 0 0
-"""
-ASF = """:units
- mass 1.0
- length 0.45
- angle deg
+ASF = """# comment
+:version 1.10
+:name test
+:units
+  mass 1.0
+  length 0.45
+  angle deg
 :root
- order TX TY TZ RX RY RZ
- axis XYZ
- position 0 0 0
- orientation 0 0 0
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
 :bonedata
- begin
-  id 1
-  name leg
-  direction 0 -1 0
-  length 5
-  axis 0 0 20 XYZ
-  dof rx
- end
+  begin
+    id 1
+    name femur
+    direction 0 -1 0
+    length 7.0
+    axis 0 0 20 XYZ
+    dof rx ry rz
+    limits (-160.0 20.0)
+           (-70.0 70.0)
+           (-60.0 70.0)
+  end
+  begin
+    id 2
+    name tibia
+    direction 0.6 -0.8 0
+    length 8.0
+    axis 10 20 30 XYZ
+    dof rx
+  end
+  begin
+    id 3
+    name foot
+    direction 0 0 1
+    length 2.0
+    axis 0 0 0 XYZ
+  end
 :hierarchy
- begin
-  root leg
- end
+  begin
+    root femur
+    femur tibia
+    tibia foot
+  end
 """
-AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nleg 10\n2\nroot 0 1 0 0 0 5\nleg 20\n"
+AMC = """#!OML:ASF test
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 1 2 3 10 20 30
+femur -5 15 25
+tibia 40
+2
+root 1 2 4 0 0 90
+femur 0 0 0
+tibia 0
+"""
 
 
-def amass() -> bytes:
-    """Three frames of the rest pose, as AMASS has them."""
+def bvh_text(order: str = "ZYX", frames: Sequence[Sequence[float]] = ((0.0,) * 12,)) -> str:
+    """A root, an arm whose middle joint can shift, and a hand with two end sites. 12 numbers a frame."""
+    rotation = " ".join(f"{a}rotation" for a in order)
+    rows = "\n".join(" ".join(f"{v:.9f}" for v in frame) for frame in frames)
+    return f"""HIERARCHY
+ROOT hip
+{{
+  OFFSET 1 2 3
+  CHANNELS 6 Xposition Yposition Zposition {rotation}
+  JOINT arm
+  {{
+    OFFSET 0 0.5 0
+    CHANNELS 6 Zposition Xposition Yposition Yrotation Xrotation Zrotation
+    End Site
+    {{
+      OFFSET 0.3 0 0
+    }}
+    End Site
+    {{
+      OFFSET 0 0 0.2
+    }}
+  }}
+}}
+MOTION
+Frames: {len(frames)}
+Frame Time: 0.04
+{rows}
+"""
+
+
+def npz(**arrays: Any) -> io.BytesIO:
+    """An archive of these arrays."""
     file = io.BytesIO()
-    np.savez(file, poses=np.zeros((3, 66)), trans=np.zeros((3, 3)), mocap_framerate=30.0)
-    return file.getvalue()
+    np.savez(file, **arrays)
+    file.seek(0)
+    return file

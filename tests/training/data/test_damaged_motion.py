@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib import format as npy
-from tests.helpers.motion_files import AMC, ASF, BVH, amass
+from tests.helpers.motion_files import AMC, ASF, bvh_text
+from tests.helpers.motion_files import npz as archive
 
 from steadypose.prior import npz
 from steadypose.prior.mocap.bvh import read_bvh
@@ -24,11 +26,12 @@ from steadypose.prior.npz import check_arrays
 from steadypose.training.data.cmu import read_amc, read_asf
 
 WORDS = [b"", b"nan", b"1e999", b"-1", b"0", b"{", b"}", b"JOINT", b"CHANNELS 99999", b"\n", b"\xff\0", b"9" * 30]
+AMASS: dict[str, Any] = {"poses": np.zeros((3, 66)), "trans": np.zeros((3, 3)), "mocap_framerate": 30.0}
 READERS: dict[str, tuple[str | bytes, Callable]] = {
-    "bvh": (BVH, lambda text: read_bvh(text).positions()),
+    "bvh": (bvh_text(), lambda text: read_bvh(text).positions()),
     "asf": (ASF, read_asf),
     "amc": (AMC, lambda text: read_amc(text, read_asf(ASF))),
-    "amass": (amass(), lambda content: read_amass(io.BytesIO(content))),
+    "amass": (archive(**AMASS).getvalue(), lambda content: read_amass(io.BytesIO(content))),
 }
 
 
@@ -45,6 +48,52 @@ def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObj
     whole = damaged.decode("ascii", "replace") if isinstance(content, str) else bytes(damaged)
     with contextlib.suppress(MotionError):
         read(whole)
+
+
+@pytest.mark.parametrize(
+    ("kind", "pattern", "instead", "message"),
+    [
+        ("bvh", ".*", "", "no MOTION"),
+        ("bvh", "HIERARCHY", "", "expected HIERARCHY"),
+        ("bvh", "OFFSET 1 2 3", "OFFSET 1 two 3", "number in the hierarchy"),
+        ("bvh", r"\}\nMOTION", "MOTION", "braces"),
+        ("bvh", "JOINT.*MOTION", "MOTION", "cut short"),
+        ("bvh", "Xrotation", "Wrotation", "unknown channels"),
+        ("bvh", "Frames: 1", "Frames: 2", "expected 2 frames of 12 numbers, found 12"),
+        ("bvh", "Time: 0.04", "Time: 0", "frame time above zero"),
+        ("bvh", r"\d\n$", "x", "number in the motion"),
+        ("asf", "angle deg", "angle rad", "degrees"),
+        ("asf", ":hierarchy", ":other", "section ':hierarchy'"),
+        ("asf", "RX RY RZ", "", "six freedoms"),
+        ("asf", "root femur", "root thigh", "not known"),
+        ("asf", "length 7.0", "length long", "expected numbers"),
+        ("asf", "length 7.0", "", "bone cannot be read"),
+        ("amc", ".*", "", "expected frames"),
+        ("amc", "tibia 0", "", "cut or mixed"),
+        ("amc", "tibia", "fibula", "bone 'tibia': expected 1 angles"),
+        ("amc", "femur 0 0 0\ntibia 0", "tibia 0\nfemur 0 0 0", "same place"),
+        ("amc", "tibia 40", "tibia x", "bone 'tibia'"),
+        ("amc", "root", "boot", "move 'root'"),
+    ],
+)
+def test_what_is_no_motion_is_refused_in_words(kind: str, pattern: str, instead: str, message: str) -> None:
+    content, read = READERS[kind]
+    with pytest.raises(MotionError, match=message):
+        read(re.sub(pattern, instead, str(content), flags=re.S))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"trans": None}, "expected arrays trans"),
+        ({"mocap_framerate": None}, "mocap_framerate"),
+        ({"poses": np.zeros((3, 9))}, "66 or more"),
+        ({"poses": np.zeros((2, 156))}, "66 or more"),
+    ],
+)
+def test_what_amass_would_not_hold_is_refused_in_words(arrays: dict[str, Any], message: str) -> None:
+    with pytest.raises(MotionError, match=message):
+        read_amass(archive(**{name: array for name, array in (AMASS | arrays).items() if array is not None}))
 
 
 def bomb(shape: tuple[int, ...]) -> io.BytesIO:
