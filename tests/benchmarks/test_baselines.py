@@ -70,12 +70,14 @@ def test_constant_acceleration_is_the_smoother_of_its_model() -> None:
 
 
 def test_a_gap_is_bridged_only_when_its_end_is_known() -> None:
-    seen = line([0.0, 1.0, NAN, NAN, 4.0, NAN, 6.0])
-    stamps = np.arange(7.0)
-    np.testing.assert_allclose(hold_last(seen, stamps, 0)[:, 0, 0], [0, 1, 1, 1, 4, 4, 6])
-    np.testing.assert_allclose(interpolate(seen, stamps, 0)[:, 0, 0], [0, 1, 1, 1, 4, 4, 6])
-    np.testing.assert_allclose(interpolate(seen, stamps, 1)[:, 0, 0], [0, 1, 1, 3, 4, 5, 6])
-    np.testing.assert_allclose(interpolate(seen, stamps, 2)[:, 0, 0], [0, 1, 2, 3, 4, 5, 6])
+    seen, stamps = line([0.0, 1.0, NAN, NAN, 4.0, NAN, 6.0]), np.arange(7.0)
+    for run, delay, expected in (
+        (hold_last, 0, [0, 1, 1, 1, 4, 4, 6]),
+        (interpolate, 0, [0, 1, 1, 1, 4, 4, 6]),
+        (interpolate, 1, [0, 1, 1, 3, 4, 5, 6]),
+        (interpolate, 2, [0, 1, 2, 3, 4, 5, 6]),
+    ):
+        np.testing.assert_allclose(run(seen, stamps, delay)[:, 0, 0], expected)
     open_end = line([NAN, 1.0, NAN, NAN])
     np.testing.assert_allclose(interpolate(open_end, np.arange(4.0), OFFLINE)[:, 0, 0], [NAN, 1, 1, 1])
 
@@ -118,12 +120,7 @@ def test_no_answer_knows_more_than_its_delay(baseline) -> None:
     assert whole.shape == seen.shape
 
 
-def test_tuned_filters_beat_raw_on_noise_that_they_are_made_for() -> None:
-    rng = np.random.default_rng(5)
-    truth = np.broadcast_to(np.sin(3 * STAMPS)[:, None, None, None], (40, 3, 2, 3))
-    seen = truth + rng.normal(0, 0.04, truth.shape)
-    error = np.abs(seen - truth).mean()
-    assert np.abs(constant_velocity(seen, STAMPS, 4, 1.0) - truth).mean() < 0.5 * error
+def test_only_what_fills_gaps_alone_is_no_filter() -> None:
     fill_gaps = {"hold last", "held beside the body", "linear interpolation"}
     assert {baseline.name for baseline in BASELINES} - {baseline.name for baseline in FILTERS} == fill_gaps
 
@@ -183,17 +180,11 @@ def test_a_density_a_joint_follows_a_wrist_more_closely_than_a_hip() -> None:
 
 def naive_one_euro(values: np.ndarray, stamps: np.ndarray, fmin: float, beta: float, fd: float) -> np.ndarray:
     """The paper's algorithm 1, one joint, with the norm of the velocity as its speed."""
-
-    def weight(dt: float, cutoff: float) -> float:
-        return 1 / (1 + (1 / (2 * np.pi * cutoff)) / dt)
-
-    out = [values[0]]
-    velocity = np.zeros(3)
-    for i in range(1, len(values)):
-        dt = stamps[i] - stamps[i - 1]
-        a = weight(dt, fd)
+    out, velocity = [values[0]], np.zeros(3)
+    for i, dt in enumerate(np.diff(stamps), start=1):
+        a = 1 / (1 + 1 / (2 * np.pi * fd * dt))
         velocity = a * (values[i] - values[i - 1]) / dt + (1 - a) * velocity
-        a = weight(dt, fmin + beta * float(np.linalg.norm(velocity)))
+        a = 1 / (1 + 1 / (2 * np.pi * (fmin + beta * float(np.linalg.norm(velocity))) * dt))
         out.append(a * values[i] + (1 - a) * out[-1])
     return np.array(out)
 

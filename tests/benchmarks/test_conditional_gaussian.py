@@ -20,9 +20,13 @@ def poses(count: int, seed: int) -> np.ndarray:
     return body @ turn.swapaxes(-1, -2) + rng.uniform(-3, 3, (count, 1, 3))
 
 
-def test_a_hidden_joint_is_the_regression_on_the_seen_ones() -> None:
+@pytest.fixture(scope="module")
+def gaussian() -> ConditionalGaussian:
+    return ConditionalGaussian(poses(20_000, 0))
+
+
+def test_a_hidden_joint_is_the_regression_on_the_seen_ones(gaussian: ConditionalGaussian) -> None:
     """Closed form: E[wrist | elbow] = rest + 0.6 (elbow - rest), whatever else is seen, place and heading."""
-    gaussian = ConditionalGaussian(poses(20_000, 0))
     rng = np.random.default_rng(1)
     body, angle, place = np.array(REST_POSITIONS), rng.uniform(-np.pi, np.pi), rng.uniform(-3, 3, 3)
     swing = np.array([0.1, -0.05, 0.2])
@@ -36,8 +40,7 @@ def test_a_hidden_joint_is_the_regression_on_the_seen_ones() -> None:
     np.testing.assert_array_equal(np.delete(found, WRIST, axis=0), np.delete(seen, WRIST, axis=0))
 
 
-def test_two_hidden_joints_that_nothing_tells_of_are_at_their_means() -> None:
-    gaussian = ConditionalGaussian(poses(20_000, 0))
+def test_two_hidden_joints_that_nothing_tells_of_are_at_their_means(gaussian: ConditionalGaussian) -> None:
     seen = np.array(REST_POSITIONS)
     seen[[WRIST, ELBOW]] = np.nan
     np.testing.assert_allclose(gaussian(seen)[[WRIST, ELBOW]], REST_POSITIONS[[WRIST, ELBOW]], atol=5e-3)
@@ -50,8 +53,7 @@ def test_without_a_frame_to_answer_in_it_answers_nothing(hidden: list[int]) -> N
     np.testing.assert_array_equal(ConditionalGaussian(poses(100, 0))(seen), seen)
 
 
-def test_a_heading_that_is_given_does_without_hips_and_shoulders() -> None:
-    gaussian = ConditionalGaussian(poses(20_000, 0))
+def test_a_heading_that_is_given_does_without_hips_and_shoulders(gaussian: ConditionalGaussian) -> None:
     anchors = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder")]
     turn = yaw_matrix(np.array([0.3, 2.0]))
     truth = np.einsum("nab,jb->nja", turn, REST_POSITIONS)
