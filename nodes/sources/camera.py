@@ -135,7 +135,7 @@ def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
     def connect_oak() -> AbstractContextManager[Connection]:
         from steadypose.nodes.sources.oak_device import connect  # imports depthai
 
-        return connect(settings, context.clock)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
+        return connect(settings, context.clock, context.image_file)  # pyright: ignore[reportArgumentType]  (found under two names)
 
     return CameraSource(context.clock, connect_oak)
 

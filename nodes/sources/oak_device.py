@@ -11,7 +11,7 @@ import queue
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw, RawBody
 from steadypose.nodes.graph.clock import POLL_S, Clock
+from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import CameraError, OakSettings, count_failure
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import COCO17
@@ -140,6 +141,31 @@ class ImuReader(dai.node.HostNode):
             self._level.update(self._turn @ np.array([acceleration.x, acceleration.y, acceleration.z]), stamp_ns)
 
 
+class Images(dai.node.HostNode):
+    """Stores the newest image for the viewer.
+
+    Attributes:
+        counts: number of images that could not be stored, by cause.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def build(self, colour: dai.Node.Output, writer: ImageWriter, epoch_ns: int) -> "Images":
+        """Link the node; ``colour`` is undistorted, ``epoch_ns`` as in `Skeletons.build`."""
+        self.link_args(colour)
+        self._writer, self._epoch_ns = writer, epoch_ns
+        return self
+
+    def process(self, image: dai.ImgFrame) -> None:
+        try:
+            intrinsics = np.array(image.getTransformation().getIntrinsicMatrix())
+            self._writer.put(image.getCvFrame(), self._epoch_ns + _nanoseconds(image.getTimestamp()), intrinsics)
+        except Exception as error:  # an image for the viewer must not stop the node
+            count_failure(self.counts, "image", error)
+
+
 def _pairs(pipeline: dai.Pipeline, **outputs: dai.Node.Output) -> dai.Node.Output:
     """An output of groups of messages captured at the same time, by name."""
     # a host node's own pairing tolerates only 10 ms, and would wait forever
@@ -161,6 +187,7 @@ class Host:
         readings: output of the IMU, and the rotation (3, 3) from its frame to the camera's; None without an IMU.
         source: the camera's name.
         clock: clock of the stamps.
+        images: output of undistorted colour images, and where to store them for the viewer; None for none.
     """
 
     def __init__(
@@ -171,6 +198,7 @@ class Host:
         readings: tuple[dai.Node.Output, Floats] | None,
         source: str,
         clock: Clock,
+        images: tuple[dai.Node.Output, ImageWriter] | None = None,
     ) -> None:
         self.name = source
         self.level = GravityEstimator()
@@ -181,6 +209,7 @@ class Host:
         self._skeletons = pipeline.create(Skeletons).build(pairs, self.level, source, epoch_ns)
         if readings:
             pipeline.create(ImuReader).build(readings[0], self.level, readings[1])
+        self._images = pipeline.create(Images).build(*images, epoch_ns) if images else None
 
     def status(self) -> dict[str, str]:
         return {"camera.level": "measured" if self.level.measured else "taken for level"}
@@ -188,7 +217,7 @@ class Host:
     @property
     def counts(self) -> Counter[str]:
         """Number of frames dropped or refused, by cause; a copy, because the pipeline's thread goes on counting."""
-        return self._skeletons.counts.copy()
+        return self._skeletons.counts + (self._images.counts if self._images else Counter())
 
     def frames(self) -> Iterator[PoseRaw | None]:
         """Skeletons as they arrive, or None after a while without one. Ends when the camera disconnects."""
@@ -215,15 +244,15 @@ def open_device(settings: OakSettings) -> dai.Device:
 
 
 @contextmanager
-def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
-    """Open the camera and run the whole pipeline on it.
+def connect(settings: OakSettings, clock: Clock, image_file: Path | None = None) -> Iterator[Host]:
+    """Open the camera and run the whole pipeline on it. ``image_file`` is for the newest image, for the viewer.
 
     Raises:
         RuntimeError: there is no such camera, it cannot be opened, or the model cannot be downloaded. The text is
             depthai's.
     """
     device = open_device(settings)
-    with device:
+    with device, closing(ImageWriter(image_file)) if image_file else nullcontext() as writer:
         device.setMaxReconnectionAttempts(0)  # `CameraSource` reconnects itself, and reports it
         platform = device.getPlatformAsString()
         zoo, usual_fps = MODELS.get(platform, MODELS["RVC2"])
@@ -237,9 +266,10 @@ def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
             )
             network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
             network.setConfidenceThreshold(settings.confidence)
-            _, depth = aligned_depth(pipeline, colour, platform)
+            view, depth = aligned_depth(pipeline, colour, platform)
             imu = accelerometer(pipeline, device)
-            host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock)
+            images = (view, writer) if writer else None
+            host = Host(pipeline, network.out, depth, imu, f"oak-{device.getDeviceId()}", clock, images)
             pipeline.start()
             yield host
 

@@ -65,7 +65,7 @@ class InputSettings:
     loop: bool = False
     """whether to repeat the recording endlessly, with stamps that keep increasing"""
     image: bool = False
-    """whether to give the viewer of this machine and user the newest image of a webcam or video, at most 15 per
+    """whether to give the viewer of this machine and user the newest image of an OAK, webcam or video, at most 15 per
     second"""
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)

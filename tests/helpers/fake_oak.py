@@ -19,6 +19,7 @@ import depthai as dai
 
 from steadypose.benchmarks.depth_camera import Stereo, render, room
 from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.oak_device import Host
 from steadypose.nodes.sources.source import OakSettings
 from steadypose.prior.body.layouts import COCO17
@@ -98,6 +99,14 @@ def depth_frame(moment: Moment) -> dai.ImgFrame:
     return frame
 
 
+def colour_frame(brightness: int) -> dai.ImgFrame:
+    frame = dai.ImgFrame()
+    size = (CAMERA.height, CAMERA.width, 3)
+    frame.setCvFrame(np.full(size, (brightness, 0, 10), np.uint8), dai.ImgFrame.Type.BGR888i)
+    frame.setTransformation(dai.ImgTransformation(CAMERA.width, CAMERA.height, CAMERA.intrinsics.tolist()))
+    return frame
+
+
 def readings(up: Sequence[float]) -> dai.IMUData:
     """Of an accelerometer at rest in which ``up`` points up."""
     report = dai.IMUReportAccelerometer()
@@ -113,7 +122,7 @@ class Player(dai.node.ThreadedHostNode):
     """In the place of the camera's nodes: sends each message it is given on its output, in order.
 
     Attributes:
-        outputs: ``detections``, ``depth`` and ``imu``.
+        outputs: ``detections``, ``depth``, ``colour`` and ``imu``.
     """
 
     def __init__(self) -> None:
@@ -123,6 +132,7 @@ class Player(dai.node.ThreadedHostNode):
             for name, kind in (
                 ("detections", dai.DatatypeEnum.ImgDetections),
                 ("depth", dai.DatatypeEnum.ImgFrame),
+                ("colour", dai.DatatypeEnum.ImgFrame),
                 ("imu", dai.DatatypeEnum.IMUData),
             )
         }
@@ -162,13 +172,15 @@ def plugged(
     clock: Clock,
     imu_to_camera: NDArray[np.float64] | None = None,
     unplug: Callable[[dai.Pipeline, Player], None] | None = None,
+    writer: ImageWriter | None = None,
 ) -> Iterator[Host]:
-    """A connection over which the messages come; ``unplug`` may end it."""
+    """A connection over which the messages come; ``unplug`` may end it, and ``writer`` stores its images."""
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)
         player.script = messages
         imu = None if imu_to_camera is None else (player.outputs["imu"], imu_to_camera)
-        host = Host(pipeline, player.outputs["detections"], player.outputs["depth"], imu, "oak-test", clock)
+        images = (player.outputs["colour"], writer) if writer else None
+        host = Host(pipeline, player.outputs["detections"], player.outputs["depth"], imu, "oak-test", clock, images)
         pipeline.start()
         thread = threading.Thread(target=unplug, args=(pipeline, player)) if unplug else None
         if thread:

@@ -6,15 +6,16 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import timedelta
+from pathlib import Path
 
 import depthai as dai
 import numpy as np
 import pytest
 from conftest import VirtualClock, running
 from scipy.spatial.transform import Rotation
-from tests.helpers.fake_oak import CAMERA, Moment, Player, detections, moment, opener, plugged, script
+from tests.helpers.fake_oak import CAMERA, Moment, Player, colour_frame, detections, moment, opener, plugged, script
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
@@ -27,6 +28,7 @@ from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import oak_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource, open_oak
+from steadypose.nodes.sources.image import ImageReader, ImageWriter
 from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input
@@ -62,6 +64,27 @@ def test_people_are_lifted_where_they_stand(walk: list[Moment]) -> None:
             error = np.linalg.norm(body.positions - joints, axis=-1)[BODY]
             assert np.isfinite(error).sum() >= 8
             assert np.nanmedian(error) < 0.04
+
+
+def test_the_newest_image_is_there_for_the_viewer(walk: list[Moment], tmp_path: Path) -> None:
+    messages = script(walk[:1])
+    colour = colour_frame(100)
+    colour.setTimestamp(messages[0][1].getTimestamp())
+    with (
+        closing(ImageWriter(tmp_path / "image")) as writer,
+        plugged([("colour", colour), *messages], SystemClock(), writer=writer) as host,
+    ):
+        (frame,) = take(host, 1)
+        reader = ImageReader(tmp_path / "image")
+        late = time.monotonic() + 5.0
+        while (image := reader.next()) is None and time.monotonic() < late:
+            time.sleep(0.01)
+        assert image is not None
+        assert not host.counts
+    assert image.stamp_ns == frame.stamp_ns, "drawn with the skeleton that was found in it"
+    scale = image.size[0] / CAMERA.width
+    np.testing.assert_allclose(image.intrinsics[:2], CAMERA.intrinsics[:2] * scale)
+    assert not (tmp_path / "image").exists(), "the image goes with the camera"
 
 
 def test_stamps_are_of_capture(walk: list[Moment]) -> None:

@@ -8,7 +8,7 @@ import cv2
 import depthai as dai
 import numpy as np
 import pytest
-from tests.helpers.fake_oak import CAMERA, Player, depth_frame, moment, readings
+from tests.helpers.fake_oak import CAMERA, Player, colour_frame, depth_frame, moment, readings
 
 from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.graph.launch import Launch
@@ -21,27 +21,19 @@ from steadypose.prior.camera.calibration import CalibrationError
 UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
 
 
-def image(brightness: int) -> dai.ImgFrame:
-    frame = dai.ImgFrame()
-    frame.setCvFrame(
-        np.full((CAMERA.height, CAMERA.width, 3), (brightness, 0, 10), np.uint8), dai.ImgFrame.Type.BGR888i
-    )
-    return frame
-
-
 def test_the_image_after_those_in_which_the_camera_settles() -> None:
     scene = moment(0)
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)
-        colour = player.createOutput(possibleDatatypes=[dai.Node.DatatypeHierarchy(dai.DatatypeEnum.ImgFrame, False)])
-        player.outputs["colour"] = colour
         player.script = [("imu", readings(UP.tolist()))]
         start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
         for index in range(2):
-            for name, message in (("colour", image(100 + index)), ("depth", depth_frame(scene))):
+            for name, message in (("colour", colour_frame(100 + index)), ("depth", depth_frame(scene))):
                 message.setTimestamp(start + index * oak_device.SYNC_THRESHOLD * 2)
                 player.script.append((name, message))
-        still = capture(pipeline, colour, player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1)
+        still = capture(
+            pipeline, player.outputs["colour"], player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1
+        )
     assert still.colour[0, 0].tolist() == [101, 0, 10]
     np.testing.assert_array_equal(still.depth, scene.depth)
     np.testing.assert_allclose(still.intrinsics, CAMERA.intrinsics)
