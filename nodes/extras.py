@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from steadypose import PACKAGE
 from steadypose.nodes.settings import LaunchError
 
 
-@dataclass(frozen=True)
-class Extra:
-    """One entry of ``[project.optional-dependencies]``."""
+class Extra(NamedTuple):
+    """One entry of ``[project.optional-dependencies]``: what needs it, import names of its modules, size if large."""
 
     purpose: str
-    """what needs it"""
     modules: tuple[str, ...]
-    """import names of the modules that it installs"""
     size: str = ""
-    """size of its download, if it is large"""
 
 
 EXTRAS: Mapping[str, Extra] = {

@@ -19,11 +19,12 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import VIDEOS
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.nodes.sources.webcam_device import stamped_images
 from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import CalibrationError, Intrinsics
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEO_STEP_S = 0.5
+VIDEO_STEP_NS = 500_000_000
 """between the images taken from a video: nearer ones show the same again"""
 MAX_PICTURES = 60
 AXIS_PX = 4
@@ -62,21 +63,14 @@ def read_images(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
 
 
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
-    video = cv2.VideoCapture(str(file))
-    fps = video.get(cv2.CAP_PROP_FPS)
-    fps = fps if 1.0 <= fps <= 1000.0 else 30.0  # some files lack it, or have their time base there
-    step, taken, index = max(round(VIDEO_STEP_S * fps), 1), 0, 0
-    while taken < MAX_PICTURES and video.grab():
-        if index % step == 0:
-            good, frame = video.retrieve()
-            if good:
-                taken += 1
-                yield (
-                    f"{file.name} at {index / fps:.1f} s",
-                    np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), np.uint8),
-                )
-        index += 1
-    video.release()
+    taken = next_ns = 0
+    for stamp_ns, image in stamped_images(cv2.VideoCapture(str(file))):
+        if taken == MAX_PICTURES:
+            break
+        if image is not None and stamp_ns >= next_ns:
+            taken, next_ns = taken + 1, stamp_ns + VIDEO_STEP_NS
+            grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            yield f"{file.name} at {stamp_ns / 1e9:.1f} s", np.asarray(grey, np.uint8)
     if not taken:
         raise CalibrationError(f"{file}: expected a video that OpenCV reads, got no frame of it")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
@@ -64,10 +63,11 @@ def info(
     published = False
     for endpoint in endpoints_of(target, launch, endpoints):
         with subscribe(target, launch, (endpoint,)) as subscriber:
-            arrivals, contents = _listen(subscriber)
-        published |= bool(arrivals)
-        print(f"  {endpoint}: {plural(len(arrivals), 'message', 'messages')} in {INFO_S:g} s{Rate.of(arrivals).brief}")
-        if arrivals:
+            contents = _listen(subscriber)
+        times = contents.times
+        published |= bool(times)
+        print(f"  {endpoint}: {plural(len(times), 'message', 'messages')} in {INFO_S:g} s{Rate.of(times).brief}")
+        if times:
             print(f"    {contents}")
     if not published:
         print("nobody publishes it there: is `steadypose run` running?")
@@ -75,13 +75,15 @@ def info(
 
 
 class _Contents:
-    """What messages speak of, gathered."""
+    """What messages speak of, and when they came, in seconds."""
 
     def __init__(self) -> None:
-        self._names: dict[str, Counter[str]] = {}
+        self.times: list[float] = []
+        self._names: dict[str, dict[str, None]] = {}
         self._bodies: set[int] = set()
 
-    def add(self, message: Message) -> None:
+    def add(self, message: Message, time_s: float) -> None:
+        self.times.append(time_s)
         if isinstance(message, Diagnostics):
             self._note("nodes", message.node)
             return
@@ -97,27 +99,22 @@ class _Contents:
             self._bodies.update(body.id for body in message.bodies)
 
     def _note(self, what: str, name: str) -> None:
-        self._names.setdefault(what, Counter())[name] += 1
+        self._names.setdefault(what, {})[name] = None
 
     def __str__(self) -> str:
-        return printable(self._text())
-
-    def _text(self) -> str:
         parts = [f"{what} {', '.join(names)}" for what, names in self._names.items()]
-        return "; ".join([*parts, f"body ids {_enumerate(sorted(self._bodies))}"] if self._bodies else parts)
-
-
-def _enumerate(ids: list[int], limit: int = 8) -> str:
-    return ", ".join(map(str, ids[:limit])) + (f" and {len(ids) - limit} more" if len(ids) > limit else "")
+        if self._bodies:
+            ids = sorted(self._bodies)
+            more = f" and {len(ids) - 8} more" if len(ids) > 8 else ""
+            parts.append(f"body ids {', '.join(map(str, ids[:8]))}{more}")
+        return printable("; ".join(parts))
 
 
 def _describe_recording(path: Path) -> Iterator[str]:
     with RecordingReader(path) as recording:
         contents = {topic: _Contents() for topic in recording.topics}
-        stamps: dict[str, list[float]] = {topic: [] for topic in recording.topics}
         for topic, stamp_ns, message in recording:
-            contents[topic].add(message)
-            stamps[topic].append(stamp_ns / 1e9)
+            contents[topic].add(message, stamp_ns / 1e9)
         files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
         start = datetime.fromtimestamp(recording.start_ns / 1e9, timezone.utc)
         size = sum(file.stat().st_size for file in files) / 1e6
@@ -129,7 +126,7 @@ def _describe_recording(path: Path) -> Iterator[str]:
             where = plural(recording.gaps, "place", "places")
             yield f"damaged: {recording.lost_bytes} bytes in {where} cannot be read; `steadypose repair` saves the rest"
         for topic in recording.topics:
-            rate = Rate.of(stamps[topic])
+            rate = Rate.of(contents[topic].times)
             yield f"{topic}: {wire_type(TOPICS[topic])}"
             yield f"    {plural(rate.count, 'message', 'messages')}{rate.brief}"
             yield f"    {contents[topic]}"
@@ -137,17 +134,13 @@ def _describe_recording(path: Path) -> Iterator[str]:
             yield f"{topic}: {plural(count, 'message', 'messages')} that cannot be decoded"
 
 
-def _listen(subscriber: Subscriber) -> tuple[list[float], _Contents]:
-    """Times of arrival and contents of what comes in a short while."""
-    arrivals: list[float] = []
+def _listen(subscriber: Subscriber) -> _Contents:
     contents = _Contents()
     until = time.monotonic() + INFO_S
     while (left := until - time.monotonic()) > 0:
-        received = subscriber.receive(min(left, POLL_S))
-        if received is not None:
-            arrivals.append(time.monotonic())
-            contents.add(received[1])
-    return arrivals, contents
+        if received := subscriber.receive(min(left, POLL_S)):
+            contents.add(received[1], time.monotonic())
+    return contents
 
 
 def describe_file(path: Path) -> Iterator[str]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from steadypose.nodes.graph.launch import read_toml
@@ -73,26 +73,25 @@ def prepare(
     if rig is not None:
         read = partial(read_own, description=describe(read_toml(rig)))
         sources = [(path, replace(s, read=read) if s.name == "own" else s) for path, s in sources]
-    result = _Result()
-    columns = (
-        TextColumn("{task.description:<24}"),
-        BarColumn(),
-        TextColumn("{task.fields[count]}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        tasks = [progress.add_task(path.name, start=False, total=1.0, count="") for path, _ in sources]
-        for task, (path, data_set) in zip(tasks, sources, strict=True):
-            progress.start_task(task)
-            _read(path, data_set, result, progress, task, speeds)
-    if not result.prepared:
-        raise PrepareError(f"nothing usable in {mocap}; dropped: {len(result.dropped)}")
+    found: list[Prepared | Dropped] = []
+    with Progress(console=console) as progress:
+        for path, data_set in sources:
+            found += _read(path, data_set, speeds, progress)
+    prepared = [part for part in found if isinstance(part, Prepared)]
+    dropped = [part for part in found if isinstance(part, Dropped)]
+    if not prepared:
+        raise PrepareError(f"nothing usable in {mocap}; dropped: {len(dropped)}")
     out.mkdir(parents=True, exist_ok=True)
-    write_prepared(result.prepared, out / "prepared.npz")
+    write_prepared(prepared, out / "prepared.npz")
     report = out / "prepare-report.json"
-    report.write_text(json.dumps(result.report(), indent=1) + "\n")
-    console.print(result.hours_table())
-    console.print(result.dropped_table())
+    report.write_text(json.dumps(_report(prepared, dropped), indent=1) + "\n")
+    console.print(_hours_table(prepared))
+    # how many recordings of a source were dropped for a kind of cause: its words without names and numbers
+    causes = Table("source", "cause", title=f"Dropped: {len(dropped)}, each with its cause in {report.name}", box=None)
+    causes.add_column("recordings", justify="right")
+    for (source, kind), count in Counter((d.source, d.kind) for d in dropped).items():
+        causes.add_row(source, kind, str(count))
+    console.print(causes)
     console.print(f"wrote {out / 'prepared.npz'} and {report}")
 
 
@@ -114,93 +113,65 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
     return found
 
 
-@dataclass
-class _Result:
-    prepared: list[Prepared] = field(default_factory=list)
-    dropped: list[Dropped] = field(default_factory=list)
+def _hours(prepared: Sequence[Prepared]) -> dict[tuple[str, str, str], dict[str, tuple[int, float]]]:
+    """(source, licence, set) -> split -> recordings and hours."""
+    table: dict[tuple[str, str, str], dict[str, tuple[int, float]]] = defaultdict(dict)
+    for p in prepared:
+        row = table[p.clip.source, p.clip.licence, p.weights]
+        count, hours = row.get(p.split, (0, 0.0))
+        row[p.split] = (count + 1, hours + len(p.clip.positions) / FPS / 3600)
+    return table
 
-    def causes(self) -> Counter[tuple[str, str]]:
-        """How many recordings of a source were dropped for a kind of cause (its words without names and numbers)."""
-        return Counter((d.source, d.kind) for d in self.dropped)
 
-    def hours(self) -> dict[tuple[str, str, str], dict[str, tuple[int, float]]]:
-        """(source, licence, set) -> split -> recordings and hours."""
-        table: dict[tuple[str, str, str], dict[str, tuple[int, float]]] = defaultdict(dict)
-        for p in self.prepared:
-            row = table[p.clip.source, p.clip.licence, p.weights]
-            count, hours = row.get(p.split, (0, 0.0))
-            row[p.split] = (count + 1, hours + len(p.clip.positions) / FPS / 3600)
-        return table
+def _report(prepared: Sequence[Prepared], dropped: Sequence[Dropped]) -> dict[str, object]:
+    return {
+        "hours": [
+            {
+                "source": source,
+                "licence": licence,
+                "set": weights,
+                **{s: {"clips": n, "hours": round(h, 3)} for s, (n, h) in sorted(splits.items())},
+            }
+            for (source, licence, weights), splits in _hours(prepared).items()
+        ],
+        "dropped": [asdict(d) for d in dropped],
+        "not_flat": [p.clip.name for p in prepared if not p.flat],
+    }
 
-    def report(self) -> dict[str, object]:
-        return {
-            "hours": [
-                {
-                    "source": source,
-                    "licence": licence,
-                    "set": weights,
-                    **{s: {"clips": n, "hours": round(h, 3)} for s, (n, h) in sorted(splits.items())},
-                }
-                for (source, licence, weights), splits in self.hours().items()
-            ],
-            "dropped": [asdict(d) for d in self.dropped],
-            "not_flat": [p.clip.name for p in self.prepared if not p.flat],
-        }
 
-    def hours_table(self) -> Table:
-        table = Table(title="Prepared: recordings and hours at 30 Hz", box=None, pad_edge=False)
-        for name in ("source", "weights"):
-            table.add_column(name)
-        for split in SPLITS:
-            table.add_column(split, justify="right")
-            table.add_column("hours", justify="right")
-        sums: dict[str, list[float]] = defaultdict(lambda: [0.0] * 2 * len(SPLITS))
-        for (source, _, weights), splits in self.hours().items():
-            row = [value for split in SPLITS for value in splits.get(split, (0, 0.0))]
-            table.add_row(source, weights, *_cells(row))
-            sums[weights] = [a + b for a, b in zip(sums[weights], row, strict=True)]
-        table.add_section()
-        for weights, row in sums.items():
-            table.add_row("total", weights, *_cells(row))
-        return table
-
-    def dropped_table(self) -> Table:
-        table = Table(title=f"Dropped: {len(self.dropped)}, each with its cause in prepare-report.json", box=None)
-        for name in ("source", "cause"):
-            table.add_column(name)
-        table.add_column("recordings", justify="right")
-        for (source, kind), count in self.causes().items():
-            table.add_row(source, kind, str(count))
-        return table
+def _hours_table(prepared: Sequence[Prepared]) -> Table:
+    table = Table("source", "weights", title="Prepared: recordings and hours at 30 Hz", box=None, pad_edge=False)
+    for split in SPLITS:
+        table.add_column(split, justify="right")
+        table.add_column("hours", justify="right")
+    sums: dict[str, list[float]] = defaultdict(lambda: [0.0] * 2 * len(SPLITS))
+    for (source, _, weights), splits in _hours(prepared).items():
+        row = [value for split in SPLITS for value in splits.get(split, (0, 0.0))]
+        table.add_row(source, weights, *_cells(row))
+        sums[weights] = [a + b for a, b in zip(sums[weights], row, strict=True)]
+    table.add_section()
+    for weights, row in sums.items():
+        table.add_row("total", weights, *_cells(row))
+    return table
 
 
 def _cells(row: list[float]) -> list[str]:
     return [f"{value:.{2 * (place % 2)}f}" for place, value in enumerate(row)]
 
 
-def _read(
-    path: Path, data_set: DataSet, result: _Result, progress: Progress, task: TaskID, speeds: Sequence[float]
-) -> None:
-    kept = dropped = 0
-    reading = True
-    seconds = 0.0
+def _read(path: Path, data_set: DataSet, speeds: Sequence[float], progress: Progress) -> list[Prepared | Dropped]:
+    task = progress.add_task(path.name, total=1.0)
+    found: list[Prepared | Dropped] = []
 
     def advance(fraction: float) -> None:
-        count = f"{kept} recordings, {seconds / 60:.1f} min, {dropped} dropped"
-        fraction = min(fraction, 0.99) if reading else 1.0
-        progress.update(task, completed=fraction, count=count)
+        kept = [part.clip.seconds for part in found if isinstance(part, Prepared)]
+        told = f"{len(kept)} recordings, {sum(kept) / 60:.1f} min, {len(found) - len(kept)} dropped"
+        progress.update(task, completed=fraction, description=f"{path.name}: {told}")
 
     for clip in _clips(path, data_set, advance):
-        for part in [clip] if isinstance(clip, Dropped) else _prepared(clip, data_set, speeds):
-            if isinstance(part, Dropped):
-                result.dropped.append(part)
-                dropped += 1
-            else:
-                result.prepared.append(part)
-                kept += 1
-                seconds += part.clip.seconds
-    reading = False
+        found += [clip] if isinstance(clip, Dropped) else _prepared(clip, data_set, speeds)
     advance(1.0)
+    return found
 
 
 def _clips(path: Path, data_set: DataSet, advance: Callable[[float], None]) -> Iterator[Clip | Dropped]:

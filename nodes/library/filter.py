@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from steadypose.msgs.codec import MAX_BODIES
-from steadypose.msgs.types import JOINTS, CleanBody, Pose, PoseClean, PoseRaw, RawBody, WorldBody
+from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
+from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.checks.layout import axes_hint, skeleton_hint
 from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
@@ -19,15 +20,10 @@ from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.library.arrays import SkeletonLike, as_array, compile_loops, sections, skeleton_name, warn
 from steadypose.nodes.library.poses import Poses
+from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.clean.pipeline import load_loops
 from steadypose.prior.clean.settings import PriorSettings
-
-_OF_CLEAN = ("positions", "rotations", "state", "sigma", "anomaly", "anomaly_flag", "joint_anomaly")
-_OF_WORLD = {"world_positions": "positions", "root_velocity": "root_velocity", "contacts": "contacts"}
-_NO_WORLD = {"world_positions": np.full((22, 3), np.nan), "root_velocity": np.full(3, np.nan)}
-_NO_WORLD |= {"contacts": np.full(8, np.nan)}
-_NAMES = np.array(JOINTS)
 
 
 class FilterError(ValueError):
@@ -161,11 +157,20 @@ class Filter:
     def _poses(self, cleaned: list[PoseClean]) -> list[Poses]:
         poses = []
         for clean in cleaned:
-            world = {body.id: body for moment in self._trajectory.process(clean) for body in moment.bodies}
+            answers: list[tuple[str, Message]] = [(POSE_CLEAN, clean)]
+            answers += [(POSE_WORLD, world) for world in self._trajectory.process(clean)]
             if clean.bodies:
                 self._recognised = True
-                poses.append(Poses(_arrays(clean, world, several=self._several), self.problems))
+                poses.append(Poses(self._arrays(NpzCollector(answers).newest), self.problems))
         return poses
+
+    def _arrays(self, rows: dict[int, NDArray[np.void]]) -> dict[str, NDArray[Any]]:
+        """The arrays of `NpzCollector` for a single frame; without an axis of bodies, of the first."""
+        table = np.stack(list(rows.values()))
+        shown = table if self._several else table[0]
+        arrays = {name: np.asarray(shown[name]) for name in table.dtype.names or ()}
+        arrays |= {"stamp_ns": np.asarray(table["stamp_ns"][0]), "joint_names": np.array(JOINTS)}
+        return arrays | ({"body_id": np.array(list(rows), np.int32)} if self._several else {})
 
     def _bodies(
         self, joints: ArrayLike, confidence: ArrayLike | None, ids: Sequence[int] | None
@@ -214,19 +219,3 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
     if t >= 2**31:  # type: ignore[operator]
         raise FilterError(f"t: expected seconds, got {t!r}; say stamp_ns= of nanoseconds, divide milliseconds by 1000")
     return round(t * 1e9)  # type: ignore[operator]
-
-
-def _arrays(clean: PoseClean, world: Mapping[int, WorldBody], *, several: bool) -> dict[str, NDArray[Any]]:
-    """The arrays of `NpzCollector` for a single frame."""
-    bodies = clean.bodies if several else clean.bodies[:1]
-    rows = [_row(body, world.get(body.id)) for body in bodies]
-    common: dict[str, NDArray[Any]] = {"stamp_ns": np.array(clean.stamp_ns), "joint_names": _NAMES}
-    if not several:
-        return rows[0] | common
-    stacked = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return stacked | common | {"body_id": np.array([body.id for body in bodies], np.int32)}
-
-
-def _row(body: CleanBody, world: WorldBody | None) -> dict[str, NDArray[Any]]:
-    of_clean = {name: np.asarray(getattr(body, name)) for name in _OF_CLEAN}
-    return of_clean | ({own: getattr(world, name) for own, name in _OF_WORLD.items()} if world else _NO_WORLD)

@@ -27,9 +27,16 @@ if TYPE_CHECKING:
 
 ALWAYS = ("stamp_ns", "joint_names", "body_id")
 """Arrays without an axis of bodies."""
-BY_CONTACT, BY_JOINT = ("contacts",), ("joint_anomaly", "rotations", "sigma", "state", "positions", "world_positions")
-_NAMES = dict.fromkeys(BY_CONTACT, CONTACTS) | dict.fromkeys(BY_JOINT, JOINTS)
-_LAST = ("x", "y", "z", "w")
+AXES: dict[str, tuple[str, ...]] = {
+    "positions": ("joint", "axis"),
+    "world_positions": ("joint", "axis"),
+    "rotations": ("joint", "quaternion"),
+    "contacts": ("contact",),
+    "root_velocity": ("axis",),
+    **dict.fromkeys(("state", "sigma", "joint_anomaly"), ("joint",)),
+    **dict.fromkeys(("anomaly", "anomaly_flag"), ()),
+}
+"""Axes of each array after those of time and bodies."""
 
 
 class ByName(NDArray[Any] if TYPE_CHECKING else np.ndarray):
@@ -183,17 +190,13 @@ class Poses(dict[str, NDArray[Any]]):
         xarray = _installed("xarray")
 
         lead = [*(["time"] if self["stamp_ns"].ndim else []), *(["body"] if "body_id" in self else [])]
-        tails: dict[str, list[str]] = {"positions": ["joint", "axis"], "world_positions": ["joint", "axis"]}
-        tails |= {"rotations": ["joint", "quaternion"], "contacts": ["contact"], "root_velocity": ["axis"]}
-        tails |= {name: ["joint"] for name in ("state", "sigma", "joint_anomaly")}
-        tails |= {"anomaly": [], "anomaly_flag": []}
         coordinates: dict[str, Any] = {"joint": list(JOINTS), "contact": list(CONTACTS), "axis": list("xyz")}
-        coordinates |= {"quaternion": list(_LAST), "stamp_ns": (lead[:1] if "time" in lead else [], self["stamp_ns"])}
+        coordinates |= {"quaternion": list("xyzw"), "stamp_ns": (lead[:1] if "time" in lead else [], self["stamp_ns"])}
         if "time" in lead:
             coordinates["time"] = np.asarray(self.t)
         if "body_id" in self:
             coordinates["body"] = self["body_id"]
-        return xarray.Dataset({name: (lead + tails[name], self[name]) for name in tails}, coords=coordinates)
+        return xarray.Dataset({name: ([*lead, *own], self[name]) for name, own in AXES.items()}, coords=coordinates)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Convert to a table with one row per frame and body, and columns such as ``left_wrist_x`` (metres, world).
@@ -221,8 +224,8 @@ class Poses(dict[str, NDArray[Any]]):
         return f"<Poses {', '.join(f'{name} {array.shape}' for name, array in self.items())}>"
 
     def _by_name(self, name: str) -> ByName:
-        axis = -2 if name in ("positions", "world_positions", "rotations") else -1
-        return ByName.of(self[name], _NAMES[name], axis)
+        first, *others = AXES[name]
+        return ByName.of(self[name], CONTACTS if first == "contact" else JOINTS, -1 - len(others))
 
 
 def _installed(name: str) -> Any:

@@ -48,23 +48,24 @@ class NpzCollector:
 
     def __init__(self, messages: Iterable[tuple[str, Message]] = ()) -> None:
         self._rows: dict[int, list[NDArray[np.void]]] = {}
-        self._newest: dict[int, NDArray[np.void]] = {}
+        self.newest: dict[int, NDArray[np.void]] = {}
+        """the row of each body in the last ``pose/clean``, by its id"""
         for _, message in messages:
             self.add(message)
 
     def add(self, message: Message) -> None:
         """Add the next message of the stream. At each stamp, ``pose/clean`` must come before ``pose/world``."""
         if isinstance(message, PoseClean):
-            self._newest = {}
+            self.newest = {}
             for body in message.bodies:
-                row = self._newest[body.id] = _blank(())
+                row = self.newest[body.id] = _blank(())
                 row["stamp_ns"] = message.stamp_ns
                 for name in ("positions", "rotations", "state", "sigma", "anomaly", "anomaly_flag", "joint_anomaly"):
                     row[name] = getattr(body, name)
                 self._rows.setdefault(body.id, []).append(row)
         elif isinstance(message, PoseWorld):
             for body in message.bodies:
-                row = self._newest.get(body.id)
+                row = self.newest.get(body.id)
                 if row is not None and row["stamp_ns"] == message.stamp_ns:
                     row["world_positions"] = body.positions
                     row["root_velocity"] = body.root_velocity

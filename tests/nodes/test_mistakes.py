@@ -162,8 +162,6 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         {"in.txt": "x"},
         "in.txt: expected a rosbag2 directory, an .mcap",
     ),
-    "a text to look into": (["info", "in.txt"], {"in.txt": "x"}, "in.txt: expected a rosbag2 directory, an .mcap"),
-    "an empty CSV to look into": (["info", "in.csv"], {"in.csv": ""}, "in.csv: has no rows: expected a header"),
     "a folder that cannot be written to": (
         ["clean", "in.csv", "/proc/out.npz"],
         {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n0,0,0,0\n"},
@@ -173,11 +171,6 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         ["clean", "in.csv", "out.json"],
         {"in.csv": ""},
         "expected .npz or .csv for arrays, or a name without ending for a recording",
-    ),
-    "a setting that there is not": (
-        ["clean", "in.csv", "out.npz", "--set", "delya=2"],
-        {"in.csv": ""},
-        "--set delya: no such setting, did you mean 'delay'?",
     ),
     "what has not been cleaned, exported": (
         ["export", "in.csv", "out.bvh"],

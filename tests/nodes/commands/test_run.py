@@ -49,6 +49,11 @@ def ended(child: Child) -> None:
     child.poll()
 
 
+def later(child: Child, clock: VirtualClock, seconds: float) -> None:
+    clock.time_ns += round(seconds * 1e9)
+    child.poll()
+
+
 @pytest.mark.parametrize(("status", "state"), [(0, "ended"), (2, "failed")])
 def test_a_node_that_has_nothing_more_to_do_is_not_started_again(start: Start, status: int, state: str) -> None:
     child = start(f"raise SystemExit({status})")
@@ -65,11 +70,9 @@ def test_a_node_that_crashes_starts_again_a_little_later_each_time(
         ended(child)
         if pause_s:  # else it runs by now
             assert child.state == "crashed"
-            clock.time_ns += round((pause_s - 0.01) * 1e9)
-            child.poll()
+            later(child, clock, pause_s - 0.01)
             assert (child.state, child.restarts) == ("crashed", restarts)
-            clock.time_ns += 20_000_000
-            child.poll()
+            later(child, clock, 0.02)
         assert (child.state, child.restarts) == ("running", restarts + 1)
     ended(child)
     assert child.state == "crashed", "there is no last time"
@@ -81,8 +84,7 @@ def test_a_node_that_was_never_heard_has_failed_at_last(start: Start, clock: Vir
     for crashes in range(1, TRIES):
         ended(child)
         assert child.state == ("running" if crashes == 1 else "crashed")
-        clock.time_ns += round(BACKOFF_S[-1] * 1e9)
-        child.poll()
+        later(child, clock, BACKOFF_S[-1])
     ended(child)
     assert child.state == "failed"
 
@@ -91,17 +93,14 @@ def test_a_node_that_falls_silent_is_stale_then_killed_and_started_again(
     start: Start, clock: VirtualClock, said: list[str]
 ) -> None:
     child = start(FOREVER)
-    clock.time_ns += round(HUNG_S * 2e9)
-    child.poll()
+    later(child, clock, 2 * HUNG_S)
     assert child.state == "running", "the first start may take long"
     child.heard()
-    clock.time_ns += round((STALE_S + 0.1) * 1e9)
-    child.poll()
+    later(child, clock, STALE_S + 0.1)
     assert child.state == "stale"
     child.heard()
     assert child.state == "running"
-    clock.time_ns += round((HUNG_S + 0.1) * 1e9)
-    child.poll()
+    later(child, clock, HUNG_S + 0.1)
     assert "killing it" in said[0]
     assert (child.state, child.restarts, child.silent_s) == ("running", 1, 0.0)
 
