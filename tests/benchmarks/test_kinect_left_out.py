@@ -11,15 +11,18 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.progress import Progress
 
-from steadypose.benchmarks.baselines.filters import FILTERS
+from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE
 from steadypose.benchmarks.bench import Bench, Tuned
+from steadypose.benchmarks.metrics import bootstrap_ratio, position_error
+from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
-from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip
+from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, Scores, align, deviation, learn_offset, move, score
 from steadypose.benchmarks.studies.kinect_methods import (
     KNOWN,
     RIDGE,
@@ -28,7 +31,6 @@ from steadypose.benchmarks.studies.kinect_methods import (
     Kinect,
     Method,
     Stated,
-    run_filter,
     run_ours,
 )
 from steadypose.prior.body.layouts import KINECT22, to_canonical
@@ -187,42 +189,137 @@ def test_a_sensors_correction_is_judged_by_whom_it_was_not_learned_of(
         assert held.corrected_m == pytest.approx(0.5 * held.observed_m, rel=1e-6)
 
 
-def test_offsets_are_learned_on_the_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And every person is left out once, of means only who is out of step."""
-    everybody = [clip(subject, take, "") for subject in kinect_vicon.SUBJECTS for take in range(2)]
-    of_truth = {id(truth): one.subject for one in everybody for truth in (one.centres, one.markers)}
-    people: list[str] = []
+BEST = "Kalman, constant velocity"
+SCALES = {
+    ("raw", 0): 0.9, (BEST, 0): 0.85, (BEST, 4): 0.97, (BEST, OFFLINE): 1.0, ("One-Euro", 8): 1.0, (UNKNOWN, 4): 0.98,
+    (KNOWN, 4): 1.02, (TCN, 4): 0.95,
+}  # fmt: skip
+"""What each method makes of its input: it is so many times as large."""
 
-    def answer(some: Sequence[Clip], stated: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
-        people.append(some[-1].subject)
-        raw = run_filter(some, lambda seen, _: seen)
-        shape = raw[0].shape[:2]
-        told = Stated(
-            np.random.default_rng(0).uniform(0.01, 0.1, shape),
-            np.linspace(0, 1, shape[0]),
-            np.zeros(shape[0], dtype=bool),
+
+def everybody() -> list[Clip]:
+    some = [clip(subject, take, "") for subject in kinect_vicon.SUBJECTS for take in range(2)]
+    bias = np.random.default_rng(5).normal(0.0, 0.02, (len(SCORED), 3))
+    return [one._replace(markers=one.centres + bias) for one in some]
+
+
+def stated(one: Clip) -> Stated:
+    shape = one.raw.shape[:2]
+    sigma = np.random.default_rng(len(one.name)).uniform(0.01, 0.1, shape)
+    return Stated(sigma, np.linspace(0, 1, shape[0]), np.arange(shape[0]) < 3)
+
+
+def left_out(scale: float, truth: str) -> list[tuple[Scores, np.ndarray]]:
+    """Each person's scores and errors with the offset of a third of the others' clips."""
+    found = []
+    for who in kinect_vicon.SUBJECTS:
+        asked = [one for one in everybody() if one.subject == who]
+        others = [one for one in everybody() if one.subject != who][::3]
+        (known, seen), (wanted, own) = (
+            ([getattr(one, truth) for one in some], [scale * one.raw for one in some]) for some in (others, asked)
         )
-        return raw, [told for _ in some] if stated else None
+        offset, aligned = learn_offset(known, align(known, seen)), align(wanted, own)
+        errors = [position_error(move(a, offset), t) for a, t in zip(aligned, wanted, strict=True)]
+        found.append((score(wanted, aligned, offset), np.concatenate(errors)))
+    return found
 
-    def methods(self: Kinect, left_out: str, tuned: object) -> Iterator[Method]:
-        for name, stated in (("raw", False), (UNKNOWN, True), (KNOWN, True)):
-            yield Method(name, 0 if name == "raw" else 4, partial(answer, stated=stated))
 
-    def learn(truths: Sequence[np.ndarray], aligned: Sequence[np.ndarray]) -> np.ndarray:
-        taught = {of_truth[id(truth)] for truth in truths}
-        assert people[-1] not in taught
-        assert taught
-        return np.zeros((len(SCORED), 3))
+@pytest.fixture
+def result(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Result:
+    """The study of everybody, with methods that learn nothing."""
+    asked: list[tuple[Any, ...]] = []
 
-    monkeypatch.setattr(kinect_vicon, "read_clips", lambda path, subjects, every: everybody)
-    monkeypatch.setattr(kinect_vicon, "learn_offset", learn)
-    monkeypatch.setattr(Kinect, "tuned", lambda self, on: {})
+    def answer(some: Sequence[Clip], scale: float, states: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
+        return [scale * one.raw for one in some], [stated(one) for one in some] if states else None
+
+    def methods(self: Kinect, who: str, tuned: object) -> Iterator[Method]:
+        for (name, delay), scale in SCALES.items():
+            run = partial(answer, scale=scale, states=name in (UNKNOWN, KNOWN))
+            yield Method(name, delay, run, {"without": float(who[1:])})
+
+    def read(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
+        asked.append((path.name, tuple(subjects), every))
+        return everybody()
+
+    monkeypatch.setattr(kinect_vicon, "read_clips", read)
+    monkeypatch.setattr(Kinect, "tuned", lambda self, on: asked.append(tuple(one.name for one in on)) or {})
     monkeypatch.setattr(Kinect, "methods", methods)
     slow = Bench(quick=False, mocap=bench.mocap, data=bench.data, progress=bench.progress)
-    result = kinect_vicon.run(slow)
-    assert list(dict.fromkeys(people)) == list(kinect_vicon.SUBJECTS)
-    record = result.data["records"][0]
-    own = [figures["position_mm"] for who, figures in record["groups"].items() if who in kinect_vicon.SUBJECTS[1:]]
-    assert record["position_mm"] == pytest.approx(np.mean(own), abs=1e-2)
-    assert "s01" in record["groups"]
+    found = kinect_vicon.run(slow)
+    people = tuple(f"s0{n}" for n in range(1, 9))
+    names = [one.name for one in everybody()]
+    assert asked == [("ui_prmd.npz", people, 6), ("ui_prmd.npz", people, 3), tuple(names[::5])]
+    return found
+
+
+def test_each_persons_offset_is_learned_on_the_others_and_who_is_out_of_step_is_in_no_mean(result: Result) -> None:
+    records = {(record["method"], record["delay"]): record for record in result.data["records"]}
+    assert records.keys() == SCALES.keys()
+    for key, scale in SCALES.items():
+        scores = [found for found, _ in left_out(scale, "centres")]
+        skin = [found for found, _ in left_out(scale, "markers")]
+        record = records[key]
+        for who, own, markers in zip(kinect_vicon.SUBJECTS, scores, skin, strict=True):
+            assert record["groups"][who]["position_mm"] == pytest.approx(1e3 * own.position.mean(), abs=1e-3)
+            assert record["groups"][who]["moving_mm"] == pytest.approx(1e3 * own.moving.mean(), abs=1e-3)
+            assert record["markers_mm"][who] == pytest.approx(1e3 * markers.position.mean(), abs=1e-3)
+            assert record["parameters"][who] == {"without": float(who[1:])}
+        for name in ("position", "moving", "acceleration"):
+            mean = np.mean([getattr(own, name) for own in scores[1:]])
+            assert record[f"{name}_mm"] == pytest.approx(1e3 * mean, abs=1e-3)
+        joints = np.mean([own.joints for own in scores[1:]], axis=0)
+        np.testing.assert_allclose(list(record["joints_mm"].values()), 1e3 * joints, atol=1e-2)
     assert all("s01" in table.note for table in result.tables[:3])
+    assert result.data["data"]["clips"] == result.data["data"]["learning_clips"] == 16
+
+
+def test_what_is_stated_is_compared_with_each_persons_errors(result: Result) -> None:
+    told = [stated(one) for one in everybody()]
+    for name, says in ((UNKNOWN, "sensor unknown"), (KNOWN, "sensor known")):
+        (record,) = (r for r in result.data["records"] if r["method"] == name)
+        errors = [error for _, error in left_out(SCALES[name, 4], "centres")]
+        for number, (who, error) in enumerate(zip(kinect_vicon.SUBJECTS, errors, strict=True)):
+            own = (np.concatenate(part) for part in zip(*told[2 * number : 2 * number + 2], strict=True))
+            expected = deviation(error, *own)
+            assert record["deviation"][who] == expected
+            row = next(row for row in result.tables[3].rows if row[0] == f"{who}, {says}")
+            assert row[1] == f"{expected['rank_correlation']:.2f}"
+            assert row[-1] == f"{expected['flagged_percent']:.2f}" == "15.00"
+        assert f"{name}, delay 4" in result.data["reliability"]
+
+
+def test_steadypose_is_compared_with_the_best_filter_of_its_delay_and_the_convolution(result: Result) -> None:
+    (record,) = (r for r in result.data["records"] if r["method"] == UNKNOWN)
+    compared = ((UNKNOWN, 4), (BEST, 4), (TCN, 4))
+    ours, *rivals = ([found for found, _ in left_out(SCALES[key], "centres")] for key in compared)
+    assert list(record["ratios"]) == [f"{BEST}, delay 4", f"{TCN}, delay 4"], "neither later ones nor offline"
+    for found, rival in zip(record["ratios"].values(), rivals, strict=True):
+        for name in ("position", "moving", "acceleration"):
+            mine, theirs = (np.concatenate([getattr(own, name) for own in some[1:]]) for some in (ours, rival))
+            assert found[name] == pytest.approx(bootstrap_ratio(mine, theirs), abs=1e-4)
+        means = ([own.position.mean() for own in some] for some in (ours, rival))
+        each = {who: a / b for who, a, b in zip(kinect_vicon.SUBJECTS, *means, strict=True)}
+        assert found["position of each"] == pytest.approx(each, abs=1e-4)
+
+
+def test_tables_have_a_row_a_method_and_a_column_a_delay(result: Result) -> None:
+    records = {(record["method"], record["delay"]): record for record in result.data["records"]}
+    for table, figure in zip(result.tables[:2], ("position_mm", "moving_mm"), strict=True):
+        assert table.columns == ["method", "delay 0", "delay 2", "delay 4", "delay 8", "offline"]
+        (row,) = (row for row in table.rows if row[0] == BEST)
+        cells = [f"{r[figure]:.1f} / {r['acceleration_mm']:.2f}" for r in (records[BEST, d] for d in (0, 4, OFFLINE))]
+        assert row[1:] == [cells[0], "", cells[1], "", cells[2]]
+    rows = {(row[0], row[1]): row for row in result.tables[2].rows}
+    raw = records["raw", 0]
+    low, high = raw["moving_ci_mm"]
+    assert rows["raw", "0"][3] == f"{raw['moving_mm']:.1f} ({low:.1f}–{high:.1f})"
+    assert rows["raw", "0"][4:12] == [f"{raw['groups'][who]['position_mm']:.1f}" for who in kinect_vicon.SUBJECTS]
+    assert (BEST, "offline") in rows
+
+
+def test_a_quick_check_is_of_three_people(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(kinect_vicon, "read_clips", lambda *arguments: asked.append(arguments[1:]))
+    with pytest.raises(TypeError):  # there are no clips
+        kinect_vicon.run(bench)
+    assert asked == [(("s01", "s05", "s08"), 66), (("s01", "s05", "s08"), 40)]

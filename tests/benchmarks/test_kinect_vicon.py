@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
 from steadypose.benchmarks.bench import Bench, Tuned
-from steadypose.benchmarks.studies import kinect_methods
+from steadypose.benchmarks.studies import kinect_clips, kinect_methods
 from steadypose.benchmarks.studies.kinect_clips import (
+    MARKERS,
     SCORED,
     Clip,
     align,
@@ -25,6 +26,7 @@ from steadypose.benchmarks.studies.kinect_clips import (
 from steadypose.benchmarks.studies.kinect_methods import Kinect, Stated, best_without, run_filter
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
+from steadypose.training.data.ui_prmd import KinectPair
 from steadypose.training.loop import TrainingOptions
 
 REST = np.array(
@@ -219,3 +221,25 @@ def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
         assert a[f"{name}_mm"] == b[f"{name}_mm"] == pytest.approx(1e3 * getattr(scores, name)[1:].mean(), abs=1e-2)
         assert a[f"{name}_ci_mm"] == b[f"{name}_ci_mm"]
     assert a["groups"]["done right"] == b["groups"]["done right"]
+
+
+def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["spare", *{marker for markers in MARKERS.values() for marker in markers}]
+    rng, shapes = np.random.default_rng(0), ((5, 22, 3), (5, 22, 3), (5, len(names), 3))
+    pairs = [
+        KinectPair(f"{who} {take}", who, "m01", 30.0, *(rng.normal(size=shape) for shape in shapes))
+        for who in ("s01", "s02") for take in range(5)
+    ]  # fmt: skip
+    monkeypatch.setattr(kinect_clips, "load_pairs", lambda path, who: [pair for pair in pairs if pair.subject in who])
+    np.savez(tmp_path / "pairs.npz", vicon_names=names)
+    found = kinect_clips.read_clips(tmp_path / "pairs.npz", ("s02", "s01"), 3)
+    assert [one.name for one in found] == ["s02 0", "s02 3", "s01 0", "s01 3"]
+    assert [one.subject for one in found] == ["s02", "s02", "s01", "s01"]
+    pair, one = pairs[3], found[3]
+    wrist, back = SCORED.index("left_wrist"), [names.index(marker) for marker in ("LWRA", "LWRB")]
+    np.testing.assert_array_equal(one.kinect, pair.kinect)
+    np.testing.assert_array_equal(one.raw[:, wrist], to_canonical(KINECT22, pair.kinect)[0][:, J["left_wrist"]])
+    np.testing.assert_array_equal(one.centres[:, wrist], pair.vicon[:, J["left_wrist"]])
+    np.testing.assert_allclose(one.markers[:, wrist], pair.markers[:, back].mean(axis=1))

@@ -66,3 +66,17 @@ def test_the_best_that_was_tried_is_kept(monkeypatch) -> None:
     best = optimiser._search(x, seen, np.zeros(1, np.int64), torch.eye(3)[None])
     assert float(original(seen, best)) == min(losses[:13])
     assert losses[-1] > min(losses) < losses[0]
+
+
+def test_who_is_still_before_and_after_a_gap_is_still_in_it(monkeypatch) -> None:
+    """Though the model, all of whose weights are 0, decodes another pose: the way to the known ones goes over time."""
+    optimiser, model, _ = make(monkeypatch)
+    monkeypatch.setattr(optimise, "LATENT_STEPS", 1)
+    monkeypatch.setattr(optimise, "DECODER_STEPS", 0)
+    with torch.no_grad():
+        for p in model.parameters():
+            p.zero_()
+    positions = np.tile(waving(1), (WINDOW, 1, 1))
+    positions[6:9] = np.nan
+    rotations, _ = optimiser(positions[None], REST_OFFSETS[None])
+    np.testing.assert_allclose(rotations[0, 6:9], np.tile(rotations[0, :1], (3, 1, 1, 1)), atol=1e-6)

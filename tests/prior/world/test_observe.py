@@ -115,8 +115,8 @@ def test_a_root_is_as_sure_as_the_pelvis_and_less_so_if_it_is_inferred() -> None
 
 
 def test_feet_may_anchor_if_they_have_not_moved_and_they_or_the_root_are_observed() -> None:
-    tenths = np.arange(8, dtype=np.float32) / 10
-    chances = Contacts(tenths, tenths / 2, tenths[:1])
+    load, rest = (np.linspace(0.0, most, 8, dtype=np.float32) for most in (0.7, 0.35))
+    chances = Contacts(load, rest, np.zeros(1, np.float32))
     feet = [CONTACT_JOINTS.index(joint) for joint in FEET]
     found = stance(chances, seen(), np.array([0.0, 2.9, 3.1, 0.0]))
     np.testing.assert_allclose(found.load, np.array(feet) / 10 * [1, 1, 0, 1])
