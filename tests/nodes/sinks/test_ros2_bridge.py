@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -28,7 +29,7 @@ from steadypose.nodes import ros2 as connecting
 from steadypose.nodes.commands.doctor import required
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.ros2.definitions import Connection, deserialise, stamp_ns
+from steadypose.nodes.ros2.definitions import Connection, deserialise, new, serialise, stamp_ns
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
 from steadypose.nodes.sinks.ros2.messages import BodyTopics
@@ -36,54 +37,45 @@ from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
 from steadypose.nodes.sources.ros2 import TransformBuffer
 
 LISTENER = """
-import json, sys
+import importlib, json, sys
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray
-from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
 rclpy.init()
 node = rclpy.create_node("listener")
-heard = {}
-def note(name, convert):
-    return lambda message: heard.setdefault(name, convert(message))
-def stamp(time):
-    return time.sec * 10**9 + time.nanosec
-def point(p):
-    return [p.x, p.y, p.z]
-latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-node.create_subscription(MarkerArray, "/steadypose/markers", note("markers", lambda m: [
-    {"ns": k.ns, "stamp": stamp(k.header.stamp), "frame": k.header.frame_id, "points": [point(p) for p in k.points],
-     "colours": len(k.colors), "text": k.text} for k in m.markers]), 10)
-node.create_subscription(PoseArray, "/steadypose/poses", note("poses", lambda m: {"stamp": stamp(m.header.stamp),
-    "poses": [point(p.position) for p in m.poses]}), 10)
-node.create_subscription(JointState, "/humans/bodies/b1/joint_states", note("angles", lambda m: dict(
-    zip(m.name, m.position))), 10)
-node.create_subscription(Odometry, "/humans/bodies/b1/odom", note("odom", lambda m: {"stamp": stamp(m.header.stamp),
-    "frames": [m.header.frame_id, m.child_frame_id], "position": point(m.pose.pose.position),
-    "velocity": point(m.twist.twist.linear), "pose_covariance": list(m.pose.covariance),
-    "twist_covariance": list(m.twist.covariance)}), 10)
-node.create_subscription(String, "/humans/bodies/b1/urdf", note("urdf", lambda m: m.data), latched)
-node.create_subscription(Clock, "/clock", note("clock", lambda m: stamp(m.clock)), 10)
-node.create_subscription(DiagnosticArray, "/diagnostics", note("diagnostics", lambda m: {"name": m.status[0].name,
-    "level": m.status[0].level[0], "values": {v.key: v.value for v in m.status[0].values}}), 10)
+kinds, heard = json.loads(sys.argv[1]), {}
+for topic, kind in kinds.items():
+    package, _, name = kind.split("/")
+    kept = DurabilityPolicy.TRANSIENT_LOCAL if topic.endswith("urdf") else DurabilityPolicy.VOLATILE
+    kind = getattr(importlib.import_module(f"{package}.msg"), name)
+    hear = lambda message, topic=topic: heard.setdefault(topic, message)
+    node.create_subscription(kind, topic, hear, QoSProfile(depth=10, durability=kept))
 print("ready", flush=True)
-while len(heard) < 7:
+while len(heard) < len(kinds):
     rclpy.spin_once(node, timeout_sec=0.05)
-heard["types"] = {k: v for k, v in node.get_topic_names_and_types()}
-info = node.get_publishers_info_by_topic("/humans/bodies/b1/odom")[0]
-heard["hash"] = str(info.topic_type_hash)
-print(json.dumps(heard), flush=True)
+odom = heard["/humans/bodies/b1/odom"]
+stamp, at = odom.header.stamp, odom.pose.pose.position
+print(json.dumps({
+    "stamp": stamp.sec * 10**9 + stamp.nanosec, "frames": [odom.header.frame_id, odom.child_frame_id],
+    "position": [at.x, at.y, at.z], "types": dict(node.get_topic_names_and_types()),
+    "hash": str(node.get_publishers_info_by_topic("/humans/bodies/b1/odom")[0].topic_type_hash),
+}), flush=True)
 """
+KINDS = {
+    "/clock": "rosgraph_msgs/msg/Clock",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/humans/bodies/b1/joint_states": "sensor_msgs/msg/JointState",
+    "/humans/bodies/b1/odom": "nav_msgs/msg/Odometry",
+    "/humans/bodies/b1/urdf": "std_msgs/msg/String",
+    "/steadypose/markers": "visualization_msgs/msg/MarkerArray",
+    "/steadypose/poses": "geometry_msgs/msg/PoseArray",
+}
+Stream = tuple[list[PoseClean], list[PoseWorld]]
+NEWS = Diagnostics(1, "prior", Level.WARN, "late", {"dropped.late": "3"})
 
 
 @pytest.fixture(scope="module")
-def stream() -> tuple[list[PoseClean], list[PoseWorld]]:
+def stream() -> Stream:
     """A second of two bodies that walk, one of which has an arm hidden."""
     found = list(messages(3.0, bodies=2))
     cleans = [message for topic, message in found if topic == POSE_CLEAN]
@@ -93,17 +85,14 @@ def stream() -> tuple[list[PoseClean], list[PoseWorld]]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("ros")
-def test_a_ros_node_hears_bodies(
-    make_launch: Callable[..., Launch], tmp_path: Path, stream: tuple[list[PoseClean], list[PoseWorld]]
-) -> None:
+def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: Path, stream: Stream) -> None:
     worlds = stream[1]
     launch = make_launch(nodes='["trajectory", "ros2_bridge"]', transport__lossless="true", ros2__world_frame="odom")
-    news = Diagnostics(1, "prior", Level.WARN, "late", {"dropped.late": "3"})
     bridge = Ros2BridgeNode(launch)
     bridge.timeline = Timeline(worlds[0].stamp_ns, bridge.clock.now_ns(), 1.0)
     turn = cycle(worlds)
     with (
-        another_python(LISTENER, tmp_path) as listener,
+        another_python(LISTENER, tmp_path, json.dumps(KINDS)) as listener,
         Publisher(launch.transport.endpoint("trajectory"), reliable={"ros2_bridge"}) as publisher,
         running(bridge),
     ):
@@ -113,49 +102,63 @@ def test_a_ros_node_hears_bodies(
 
         def told() -> bool:
             publisher.publish(POSE_WORLD, next(turn), timeout_s=1)
-            publisher.publish(DIAGNOSTICS, news)
+            publisher.publish(DIAGNOSTICS, NEWS)
             return len(said) > 1
 
         until(told, timeout_s=120)
     heard = json.loads(said[-1])
     assert not bridge.health.counts
-
-    by_stamp = {message.stamp_ns: message for message in worlds}
-    poses = np.array(heard["poses"]["poses"]).reshape(2, 22, 3)
-    for body, found in zip(by_stamp[heard["poses"]["stamp"]].bodies, poses, strict=True):
-        np.testing.assert_array_equal(found, body.positions.astype(float))
-
-    marks = {mark["ns"]: mark for mark in heard["markers"]}
-    parts = ("joints", "bones", "velocity", "name")
-    assert set(marks) == {f"{body}/{part}" for body in ("b0", "b1") for part in parts}
-    drawn, bones = marks["b1/joints"], marks["b1/bones"]
-    assert (drawn["frame"], drawn["colours"], len(bones["points"]), bones["colours"]) == ("odom", 22, 42, 42)
-    np.testing.assert_array_equal(drawn["points"], by_stamp[drawn["stamp"]].bodies[1].positions.astype(float))
-
-    odom = heard["odom"]
-    body = by_stamp[odom["stamp"]].bodies[1]
-    assert odom["frames"] == ["odom", "body_b1"]
-    np.testing.assert_array_equal(odom["position"], body.root_position)
-    turned = Rotation.from_quat(body.root_orientation)
-    np.testing.assert_allclose(turned.apply(odom["velocity"]), body.root_velocity, atol=1e-9)
-    covariance = np.array(odom["pose_covariance"]).reshape(6, 6)
-    np.testing.assert_array_equal(covariance[:3, :3], body.covariance[:3, :3])
-    assert (np.linalg.eigvalsh(covariance[3:, 3:]) > 1e-5).all()  # half a degree, at least
-    assert np.trace(covariance[3:, 3:]) < 3.0 * np.pi**2
-    twist = turned.as_matrix() @ np.array(odom["twist_covariance"]).reshape(6, 6)[:3, :3] @ turned.as_matrix().T
-    np.testing.assert_allclose(twist, body.covariance[3:, 3:], atol=1e-9)
-
-    assert set(heard["angles"]) == {f"{joint}_b1" for joint in JOINTS}
-    moving = {joint.get("name") for joint in ElementTree.fromstring(heard["urdf"]).iterfind("joint[@type='revolute']")}
-    assert moving == set(heard["angles"])
-    assert heard["diagnostics"] == {"name": "steadypose: prior", "level": 1, "values": {"dropped.late": "3"}}
-    assert heard["types"]["/steadypose/pose_world"] == ["steadypose_msgs/msg/PoseWorld"]
+    body = next(message for message in worlds if message.stamp_ns == heard["stamp"]).bodies[1]
+    assert (heard["frames"], heard["position"]) == (["odom", "body_b1"], body.root_position.tolist())
     assert heard["types"]["/tf"] == ["tf2_msgs/msg/TFMessage"]
     assert heard["types"]["/humans/bodies/tracked"] == ["hri_msgs/msg/IdsList"]
     assert "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0" in heard["hash"], "as ROS has it"
 
 
-def test_the_whole_message_goes_out_in_its_own_type(stream: tuple[list[PoseClean], list[PoseWorld]]) -> None:
+def test_what_is_said_of_bodies_and_nodes(stream: Stream) -> None:
+    kept, world = Kept(), stream[1][-1]
+    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="odom"))
+    topics.send(world)
+    topics.send(NEWS)
+    (poses,), (markers,) = kept.of("steadypose/poses"), kept.of("steadypose/markers")
+    for body, found in zip(
+        world.bodies, np.array([xyz(it.position) for it in poses.poses]).reshape(2, 22, 3), strict=True
+    ):
+        np.testing.assert_array_equal(found, body.positions)
+
+    marks = {mark.ns: mark for mark in markers.markers}
+    parts = ("joints", "bones", "velocity", "name")
+    assert set(marks) == {f"{body}/{part}" for body in ("b0", "b1") for part in parts}
+    drawn, bones = marks["b1/joints"], marks["b1/bones"]
+    assert (drawn.header.frame_id, len(drawn.colors), len(bones.points), len(bones.colors)) == ("odom", 22, 42, 42)
+    np.testing.assert_array_equal([xyz(point) for point in drawn.points], world.bodies[1].positions)
+
+    (odom,), body = kept.of("humans/bodies/b1/odom"), world.bodies[1]
+    assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "body_b1")
+    np.testing.assert_array_equal(xyz(odom.pose.pose.position), body.root_position)
+    turned = Rotation.from_quat(body.root_orientation)
+    np.testing.assert_allclose(turned.apply(xyz(odom.twist.twist.linear)), body.root_velocity, atol=1e-9)
+    covariance = odom.pose.covariance.reshape(6, 6)
+    np.testing.assert_array_equal(covariance[:3, :3], body.covariance[:3, :3])
+    assert (np.linalg.eigvalsh(covariance[3:, 3:]) > 1e-5).all()  # half a degree, at least
+    assert np.trace(covariance[3:, 3:]) < 3.0 * np.pi**2
+    twist = turned.as_matrix() @ odom.twist.covariance.reshape(6, 6)[:3, :3] @ turned.as_matrix().T
+    np.testing.assert_allclose(twist, body.covariance[3:, 3:], atol=1e-9)
+
+    (state,), (urdf,) = kept.of("humans/bodies/b1/joint_states"), kept.of("humans/bodies/b1/urdf")
+    assert set(state.name) == {f"{joint}_b1" for joint in JOINTS}
+    revolute = ElementTree.fromstring(urdf.data).iterfind("joint[@type='revolute']")
+    assert {joint.get("name") for joint in revolute} == set(state.name)
+    (status,) = kept.of("diagnostics")[0].status
+    assert (status.name, status.level) == ("steadypose: prior", 1)
+    assert [(value.key, value.value) for value in status.values] == [("dropped.late", "3")]
+
+
+def xyz(point: Any) -> list[float]:
+    return [point.x, point.y, point.z]
+
+
+def test_the_whole_message_goes_out_in_its_own_type(stream: Stream) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
     clean, world = stream[0][-1], stream[1][-1]
@@ -166,7 +169,7 @@ def test_the_whole_message_goes_out_in_its_own_type(stream: tuple[list[PoseClean
     assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="map")
 
 
-def test_transforms_lead_to_every_link(stream: tuple[list[PoseClean], list[PoseWorld]]) -> None:
+def test_transforms_lead_to_every_link(stream: Stream) -> None:
     kept, buffer, world = Kept(), TransformBuffer(), stream[1][-1]
     BodyTopics(kept, Ros2BridgeSettings(world_frame="odom")).send(world)
     (told,) = kept.of("tf")
@@ -184,7 +187,7 @@ def test_transforms_lead_to_every_link(stream: tuple[list[PoseClean], list[PoseW
 
 
 def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
-    stream: tuple[list[PoseClean], list[PoseWorld]],
+    stream: Stream,
 ) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
@@ -218,7 +221,7 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
 
 
 def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(
-    stream: tuple[list[PoseClean], list[PoseWorld]],
+    stream: Stream,
 ) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings())
@@ -320,7 +323,7 @@ def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Con
 
 
 def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> None:
-    said = deserialise_text("a robot")
+    said = serialise(new("std_msgs/msg/String", data="a robot"))
     first = join()
     first.publisher("description", "std_msgs/msg/String", latched=True)(said)
     heard: list[bytes] = []
@@ -334,9 +337,3 @@ def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> 
 
     until(arrived, timeout_s=60)
     assert deserialise(heard[0], "std_msgs/msg/String").data == "a robot"
-
-
-def deserialise_text(text: str) -> bytes:
-    from steadypose.nodes.ros2.definitions import new, serialise
-
-    return serialise(new("std_msgs/msg/String", data=text))
