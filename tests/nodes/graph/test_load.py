@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
 import zmq
-from conftest import VirtualClock, raw, walk, walking
+from conftest import VirtualClock, raw, until, walk, walking
 
-from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import Message, PoseRaw
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
+from steadypose.msgs.transport import Publisher, Subscriber
+from steadypose.msgs.types import Diagnostics, Level, Message, PoseRaw
 from steadypose.nodes.checks.stream import AT_ONCE, StreamChecks
-from steadypose.nodes.graph.inbox import CALM_NS, DEADLINE_NS, LOOK_NS, BodyLimit, Inbox
+from steadypose.nodes.graph.inbox import CALM_NS, DEADLINE_NS, LONGEST, LOOK_NS, READ_AHEAD, BodyLimit, Inbox
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import CATCH_UP, PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
@@ -26,13 +31,22 @@ class Line:
 
     socket = 0
 
-    def __init__(self, clock: VirtualClock, messages: list[tuple[int, PoseRaw]]) -> None:
-        self._clock, self._messages = clock, messages
+    def __init__(self, clock: VirtualClock, messages: Sequence[tuple[int, PoseRaw | Diagnostics]]) -> None:
+        self._clock, self.messages = clock, deque(messages)
 
     def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
-        if self._messages and self._messages[0][0] <= self._clock.time_ns:
-            return POSE_RAW, self._messages.pop(0)[1]
+        if self.messages and self.messages[0][0] <= self._clock.time_ns:
+            message = self.messages.popleft()[1]
+            return DIAGNOSTICS if isinstance(message, Diagnostics) else POSE_RAW, message
         return None
+
+
+def at_once(*messages: PoseRaw | Diagnostics) -> list[tuple[int, PoseRaw | Diagnostics]]:
+    return [(0, message) for message in messages]
+
+
+def frames(count: int) -> list[PoseRaw]:
+    return [raw(k) for k in range(count)]
 
 
 def camera(clock: VirtualClock, seconds: float, source: str = "test") -> Line:
@@ -96,6 +110,72 @@ def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
         worked[message.source] += 1
         clock.time_ns += 5_000_000
     assert max(worked.values()) - min(worked.values()) <= 1
+
+
+def kept(inbox: Inbox) -> list[Message]:
+    """All that an inbox gives."""
+    return [message for _, message in iter(lambda: inbox.next(0), None)]
+
+
+def test_a_late_node_keeps_the_newest_frames_the_end_of_the_stream_and_the_news(clock: VirtualClock) -> None:
+    end, news = dataclasses.replace(raw(5), end_of_stream=True), Diagnostics(0, "pose_input", Level.OK, "")
+    line = Line(clock, at_once(*frames(5), end, news, *frames(20)))
+    inbox = Inbox([line], limit=3, clock=clock)  # type: ignore[list-item]
+    assert kept(inbox) == [end, news, *frames(20)[17:]]
+    assert inbox.overrun == 22
+
+
+def of_sources(count: int) -> list[PoseRaw]:
+    return [dataclasses.replace(raw(0), source=f"kiosk {k}") for k in range(count)]
+
+
+def test_the_streams_of_one_publisher_do_not_displace_each_other(clock: VirtualClock) -> None:
+    inbox = Inbox([Line(clock, at_once(*of_sources(20)))], limit=1, clock=clock)  # type: ignore[list-item]
+    assert len(kept(inbox)) == 20
+    assert inbox.overrun == 0
+
+
+def test_a_publisher_of_ever_new_streams_fills_no_memory(clock: VirtualClock) -> None:
+    line = Line(clock, at_once(*of_sources(LONGEST) * 4))
+    inbox = Inbox([line], limit=8, clock=clock)  # type: ignore[list-item]
+    inbox.next(0)
+    assert len(line.messages) == 4 * LONGEST - READ_AHEAD, "who sends without end does not keep it from working"
+    while line.messages:  # it reads faster than it processes
+        inbox.next(0)
+        assert len(inbox) <= LONGEST
+
+
+def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path, clock: VirtualClock) -> None:
+    quiet, loud = (f"ipc://{tmp_path}/{name}" for name in ("quiet", "loud"))
+    with ExitStack() as stack:
+        publishers = [stack.enter_context(Publisher(address)) for address in (quiet, loud)]
+        subscribers = [stack.enter_context(Subscriber(a, POSE_RAW, name="test")) for a in (quiet, loud)]
+        for publisher in publishers:
+            assert publisher.wait_for_subscribers({"test"}, timeout_s=10)
+        for _ in range(50):
+            publishers[1].publish(POSE_RAW, raw(1))
+        for _ in range(3):
+            publishers[0].publish(POSE_RAW, raw(0))
+        inbox, got = Inbox(subscribers, limit=3, clock=clock), []
+        until(lambda: all(subscriber.socket.poll(0) for subscriber in subscribers))
+
+        def all_accounted_for() -> bool:  # the flood may arrive in parts, and more than three of it be kept
+            received = inbox.next(0.1)
+            got.extend([received[1]] if received else [])
+            return len(got) + inbox.overrun == 53
+
+        until(all_accounted_for)
+        assert sum(message.stamp_ns == raw(0).stamp_ns for message in got) == 3
+        assert inbox.overrun > 0
+
+
+def test_a_lossless_node_leaves_the_rest_to_the_sender(clock: VirtualClock) -> None:
+    line = Line(clock, at_once(*frames(500)))
+    inbox = Inbox([line], limit=None, clock=clock)  # type: ignore[list-item]
+    assert inbox.next(0) is not None
+    assert len(line.messages) == 500 - READ_AHEAD, "nor is a fast source read without end"
+    assert len(kept(inbox)) == 499
+    assert inbox.overrun == 0
 
 
 def overloaded(clock: VirtualClock, limit: BodyLimit, seconds: float, ms_a_body: float, present: int) -> None:

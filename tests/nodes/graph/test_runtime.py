@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +11,8 @@ from conftest import START_NS, VirtualClock, listeners, raw, running, until, wal
 from steadypose.msgs.publisher import SEND_HIGH_WATER
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
 from steadypose.msgs.transport import Publisher, Subscriber
-from steadypose.msgs.types import Diagnostics, Level, Message, PoseClean, PoseRaw
-from steadypose.nodes.graph.clock import SystemClock, Timeline
-from steadypose.nodes.graph.inbox import LONGEST, READ_AHEAD, Inbox
+from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw
+from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 
@@ -66,99 +62,6 @@ class Listener:
 
     def close(self) -> None:
         self._subscriber.close()
-
-
-class Script:
-    """In a subscriber's place: gives what it was given."""
-
-    socket = 0
-
-    def __init__(self, messages: list[tuple[str, Message]]) -> None:
-        self.messages = messages
-
-    def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message] | None:
-        return self.messages.pop(0) if self.messages else None
-
-
-def frames(count: int) -> list[tuple[str, Message]]:
-    return [(POSE_RAW, raw(i)) for i in range(count)]
-
-
-def test_a_late_node_keeps_the_newest_frames_and_counts_the_others() -> None:
-    inbox = Inbox([Script(frames(20))], limit=3, clock=SystemClock())  # type: ignore[arg-type]
-    assert [m.stamp_ns for _, m in iter(lambda: inbox.next(0), None)] == [raw(i).stamp_ns for i in (17, 18, 19)]
-    assert inbox.overrun == 17
-
-
-def test_a_late_node_keeps_the_end_of_the_stream_and_the_news() -> None:
-    end = raw(5)
-    end.end_of_stream = True
-    news = Diagnostics(0, "pose_input", Level.OK, "")
-    script = [*frames(5), (POSE_RAW, end), (DIAGNOSTICS, news), *frames(5)]
-    inbox = Inbox([Script(script)], limit=2, clock=SystemClock())  # type: ignore[arg-type]
-    got = [m for _, m in iter(lambda: inbox.next(0), None)]
-    assert got[:2] == [end, news]
-    assert [m.stamp_ns for m in got[2:]] == [raw(i).stamp_ns for i in (3, 4)]  # type: ignore[union-attr]
-    assert inbox.overrun == 8
-
-
-def of_sources(count: int) -> list[tuple[str, Message]]:
-    return [(POSE_RAW, dataclasses.replace(raw(0), source=f"kiosk {k}")) for k in range(count)]
-
-
-def test_the_streams_of_one_publisher_do_not_displace_each_other() -> None:
-    inbox = Inbox([Script(of_sources(20))], limit=1, clock=SystemClock())  # type: ignore[arg-type]
-    assert len(list(iter(lambda: inbox.next(0), None))) == 20
-    assert inbox.overrun == 0
-
-
-def test_a_publisher_of_ever_new_streams_fills_no_memory() -> None:
-    script = Script(4 * of_sources(LONGEST))
-    inbox = Inbox([script], limit=8, clock=SystemClock())  # type: ignore[arg-type]
-    while script.messages:  # it reads faster than it processes
-        inbox.next(0)
-        assert len(inbox) <= LONGEST
-
-
-def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path) -> None:
-    quiet, loud = (f"ipc://{tmp_path}/{name}" for name in ("quiet", "loud"))
-    with ExitStack() as stack:
-        publishers = [stack.enter_context(Publisher(address)) for address in (quiet, loud)]
-        subscribers = [stack.enter_context(Subscriber(a, POSE_RAW, name="test")) for a in (quiet, loud)]
-        for publisher in publishers:
-            assert publisher.wait_for_subscribers({"test"}, timeout_s=10)
-        for _ in range(50):
-            publishers[1].publish(POSE_RAW, raw(1))
-        for _ in range(3):
-            publishers[0].publish(POSE_RAW, raw(0))
-        inbox, got = Inbox(subscribers, limit=3, clock=SystemClock()), []
-        until(lambda: all(subscriber.socket.poll(0) for subscriber in subscribers))
-
-        def all_accounted_for() -> bool:  # the flood may arrive in parts, and more than three of it be kept
-            received = inbox.next(0.1)
-            got.extend([received[1]] if received else [])
-            return len(got) + inbox.overrun == 53
-
-        until(all_accounted_for)
-        assert sum(message.stamp_ns == raw(0).stamp_ns for message in got) == 3
-        assert inbox.overrun > 0
-
-
-def test_a_source_faster_than_reading_does_not_keep_a_node_from_working() -> None:
-    class Endless(Script):
-        def receive(self, timeout_s: float, *, taken: bool = True) -> tuple[str, Message]:
-            return POSE_RAW, raw(0)
-
-    assert Inbox([Endless([])], limit=3, clock=SystemClock()).next(0) is not None  # type: ignore[arg-type]
-
-
-def test_a_lossless_node_leaves_the_rest_to_the_sender() -> None:
-    script = Script(frames(500))
-    inbox = Inbox([script], limit=None, clock=SystemClock())  # type: ignore[arg-type]
-    assert inbox.next(0) is not None
-    assert len(script.messages) == 500 - READ_AHEAD
-    assert len(list(iter(lambda: inbox.next(0), None))) == 499
-    assert inbox.overrun == 0
 
 
 def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLaunch) -> None:

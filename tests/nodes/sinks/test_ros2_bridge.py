@@ -117,6 +117,8 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
 
 def test_what_is_said_of_bodies_and_nodes(stream: Stream) -> None:
     kept, world = Kept(), stream[1][-1]
+    body = dataclasses.replace(world.bodies[1], covariance=np.diag(np.arange(1, 7) * 1e-4))
+    world = dataclasses.replace(world, bodies=[world.bodies[0], body])
     topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="odom"))
     topics.send(world)
     topics.send(NEWS)
@@ -133,7 +135,7 @@ def test_what_is_said_of_bodies_and_nodes(stream: Stream) -> None:
     assert (drawn.header.frame_id, len(drawn.colors), len(bones.points), len(bones.colors)) == ("odom", 22, 42, 42)
     np.testing.assert_array_equal([xyz(point) for point in drawn.points], world.bodies[1].positions)
 
-    (odom,), body = kept.of("humans/bodies/b1/odom"), world.bodies[1]
+    (odom,) = kept.of("humans/bodies/b1/odom")
     assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "body_b1")
     np.testing.assert_array_equal(xyz(odom.pose.pose.position), body.root_position)
     turned = Rotation.from_quat(body.root_orientation)

@@ -1,4 +1,5 @@
-"""The OAK camera's part on this machine, driven by real depthai pipelines without a camera."""
+"""The OAK camera's part on this machine, driven by real depthai pipelines without a camera: skeletons, and an image for
+its calibration."""
 
 from __future__ import annotations
 
@@ -10,16 +11,30 @@ from contextlib import closing, contextmanager
 from datetime import timedelta
 from pathlib import Path
 
+import cv2
 import depthai as dai
 import numpy as np
 import pytest
 from conftest import VirtualClock, running
 from scipy.spatial.transform import Rotation
-from tests.helpers.fake_oak import CAMERA, Moment, Player, colour_frame, detections, moment, opener, plugged, script
+from tests.helpers.fake_oak import (
+    CAMERA,
+    Moment,
+    Player,
+    colour_frame,
+    depth_frame,
+    detections,
+    moment,
+    opener,
+    plugged,
+    readings,
+    script,
+)
 
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_WORLD
+from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Subscriber
-from steadypose.msgs.types import JOINTS, Diagnostics, PoseRaw, PoseWorld
+from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld
+from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.commands.run import _check
 from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
@@ -29,11 +44,12 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import oak_device
 from steadypose.nodes.sources.camera import PAUSES_S, CameraSource, open_oak
 from steadypose.nodes.sources.image import ImageReader, ImageWriter
-from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host
+from steadypose.nodes.sources.oak_device import FRAME_ID, QUEUE, TIMEOUT_S, Host, Still, capture
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input
-from steadypose.nodes.sources.source import CalibrationSettings, OakSettings, SourceContext
+from steadypose.nodes.sources.source import CalibrationSettings, CameraError, OakSettings, SourceContext
 from steadypose.prior.body.layouts import COCO17
+from steadypose.prior.camera.calibration import CalibrationError
 
 CONTEXT = SourceContext(SystemClock(), CalibrationSettings())
 MakeLaunch = Callable[..., Launch]
@@ -128,32 +144,6 @@ def test_without_an_imu_the_camera_is_taken_for_level(walk: list[Moment]) -> Non
     frames.close()
 
 
-def test_frames_reach_subscribers_and_diagnostics_tell(make_launch: MakeLaunch, walk: list[Moment]) -> None:
-    # in the place of the prior, which a lossless node waits for
-    launch = make_launch(nodes='["pose_input", "prior"]', input__source="oak")
-    source = CameraSource(
-        CONTEXT.clock, lambda: opener(lambda _: script(walk))(launch.settings(InputSettings).oak, CONTEXT.clock)
-    )
-    node = PoseInputNode(launch, SystemClock(), source)
-    launch.transport.ipc_directory.mkdir(exist_ok=True)
-    got: list[PoseRaw] = []
-    news: dict[str, str] = {}
-    address = launch.transport.endpoint("pose_input")
-    with Subscriber(address, [POSE_RAW, DIAGNOSTICS], name="prior") as subscriber, running(node):
-        end = time.monotonic() + 20
-        while (len(got) < 2 or news.get("camera") != "streaming") and time.monotonic() < end:
-            received = subscriber.receive(1)
-            if received and isinstance(received[1], PoseRaw):
-                got.append(received[1])
-            elif received and isinstance(received[1], Diagnostics):
-                news = received[1].values
-    assert len(got) >= 2, "over a real socket"
-    assert all(len(frame.bodies) == 2 for frame in got)
-    assert (news["camera"], news["state"]) == ("streaming", "running")
-    assert news["camera.name"] == "oak-test"
-    assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
-
-
 def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oak_device, "QUEUE", 1000)  # these frames come faster than any camera's
     scene = [moment(frame) for frame in range(24)]
@@ -169,7 +159,10 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
             received = subscriber.receive(1)
             if received and isinstance(received[1], PoseWorld) and received[1].bodies:
                 worlds.append(received[1])
+        news = nodes[0].diagnostics().values
     assert len(worlds) == 12
+    assert (news["camera"], news["state"], news["camera.name"]) == ("streaming", "running", "oak-test")
+    assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
     hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
     path = np.array([one.joints[0][hips].mean(axis=0)[[0, 2]] for one in scene])
     for world in worlds[4:]:
@@ -303,7 +296,69 @@ def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
     _check(launch)
 
 
-def test_without_a_camera_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_camera_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oak_device.dai.Device, "getAllAvailableDevices", staticmethod(list))
     with pytest.raises(RuntimeError, match="no camera found"), oak_device.connect(OakSettings(), SystemClock()):
         pass
+    (tmp_path / "kitchen.toml").write_text("")
+    with pytest.raises(CalibrationError, match="no camera found"):
+        calibrate(CalibrateOak(tmp_path / "kitchen.toml", tmp_path / "floor"))
+
+
+UP = np.array([0.0, -np.cos(0.2), np.sin(0.2)])
+
+
+def test_the_image_after_those_in_which_the_camera_settles() -> None:
+    scene = moment(0)
+    with dai.Pipeline(createImplicitDevice=False) as pipeline:
+        player = pipeline.create(Player)
+        player.script = [("imu", readings(UP.tolist()))]
+        start = dai.Clock.now()  # pyright: ignore[reportCallIssue] (static)
+        for index in range(2):
+            for name, message in (("colour", colour_frame(100 + index)), ("depth", depth_frame(scene))):
+                message.setTimestamp(start + index * oak_device.SYNC_THRESHOLD * 2)
+                player.script.append((name, message))
+        still = capture(
+            pipeline, player.outputs["colour"], player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1
+        )
+    assert still.colour[0, 0].tolist() == [101, 0, 10]
+    np.testing.assert_array_equal(still.depth, scene.depth)
+    np.testing.assert_allclose(still.intrinsics, CAMERA.intrinsics)
+    assert still.up is not None
+    np.testing.assert_allclose(still.up, UP, atol=1e-6)
+
+
+def test_a_camera_that_gives_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
+    with dai.Pipeline(createImplicitDevice=False) as pipeline:
+        player = pipeline.create(Player)
+        with pytest.raises(CameraError, match="no image with depth"):
+            capture(pipeline, player.outputs["depth"], player.outputs["depth"], None)
+
+
+def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = moment(0)
+    colour = np.zeros((*scene.depth.shape, 3), np.uint8)
+    monkeypatch.setattr(oak_device, "capture_with_camera", lambda _: Still(colour, scene.depth, CAMERA.intrinsics, UP))
+    launch = tmp_path / "kitchen.toml"
+    launch.write_text('# mine\n[input]\nsource = "oak"\n')
+    calibrate(CalibrateOak(launch, tmp_path / "floor"))
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "floor.depth.png"), cv2.IMREAD_UNCHANGED), scene.depth)
+    assert (tmp_path / "floor.png").is_file()
+    told = Launch.read(launch).settings(InputSettings).calibration
+    assert list(told.size) == [CAMERA.width, CAMERA.height]
+    assert list(told.focal) == pytest.approx([CAMERA.focal, CAMERA.focal])
+    assert launch.read_text().startswith("# mine")
+    assert "floor.depth.png --up 0.000 -0.980 0.199" in capsys.readouterr().out
+
+
+def test_a_folder_that_is_not_there_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    still = Still(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4), np.uint16), CAMERA.intrinsics, UP)
+    monkeypatch.setattr(oak_device, "capture_with_camera", lambda _: still)
+    launch = tmp_path / "kitchen.toml"
+    launch.write_text("")
+    with pytest.raises(CalibrationError, match=r"gone/floor\.png cannot be written"):
+        calibrate(CalibrateOak(launch, tmp_path / "gone" / "floor"))
+    assert launch.read_text() == ""

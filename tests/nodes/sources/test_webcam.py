@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace as Made
@@ -12,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import VirtualClock
+from conftest import VirtualClock, raw, walking
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes import extras
@@ -134,7 +135,8 @@ def test_a_video_gives_every_image_at_its_own_time(video: Path, model: str) -> N
     assert not source.refused
 
 
-def test_a_video_is_a_recording_to_clean(video: Path) -> None:
+def test_a_video_is_a_recording_to_clean_with_mediapipes_own_model(video: Path) -> None:
+    pytest.importorskip("mediapipe.python.solutions", reason="no MediaPipe with a model of its own")
     source = open_recording(video)
     assert isinstance(source, VideoSource)
     frames = [message for _, message in source if isinstance(message, PoseRaw)]
@@ -214,13 +216,6 @@ def test_the_launch_file_needs_no_download() -> None:
     assert launch.settings(InputSettings).webcam == WebcamSettings()
 
 
-def test_mediapipes_own_model_looks_at_each_image_of_a_video(video: Path) -> None:
-    pytest.importorskip("mediapipe.python.solutions", reason="no MediaPipe with a model of its own")
-    frames = [frame for _, frame in VideoSource(WebcamSettings(video=str(video)), NOT_CALIBRATED)]
-    assert len(frames) == FRAMES
-    assert not any(frame.bodies for frame in frames if isinstance(frame, PoseRaw)), "nobody is in them"
-
-
 def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
     pytest.importorskip("mediapipe")
     with (
@@ -251,3 +246,32 @@ def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
     focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
     np.testing.assert_allclose(images[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
     assert [image.stamp_ns for image in images] == sorted({image.stamp_ns for image in images})
+
+
+class Flickering:
+    """A camera that gives a frame, drops another, and goes."""
+
+    name = "flickering"
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+
+    def frames(self) -> Iterator[PoseRaw | None]:
+        yield raw(0, walking(0))
+        self.counts["late"] += 1
+        yield raw(1, walking(1))
+
+    def status(self) -> dict[str, str]:
+        return {}
+
+
+def test_what_was_dropped_is_counted_over_all_connections(clock: VirtualClock) -> None:
+    source, dropped = CameraSource(clock, lambda: nullcontext(Flickering())), []
+    for frame in source.frames():
+        if frame:
+            dropped.append(source.status().get("dropped.camera late"))
+        if len(dropped) == 6:
+            break
+    assert dropped == [None, "1", "1", "2", "2", "3"]
+    assert source.refused == {"camera lost": 2}
+    assert source.status()["camera.connections"] == "3"
