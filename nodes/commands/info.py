@@ -66,7 +66,7 @@ def info(
             contents = _listen(subscriber)
         times = contents.times
         published |= bool(times)
-        print(f"  {endpoint}: {plural(len(times), 'message', 'messages')} in {INFO_S:g} s{Rate.of(times).brief}")
+        print(f"  {endpoint}: {plural(len(times), 'message', 'messages')} in {INFO_S:g} s{Rate(times).brief}")
         if times:
             print(f"    {contents}")
     if not published:
@@ -126,7 +126,7 @@ def _describe_recording(path: Path) -> Iterator[str]:
             where = plural(recording.gaps, "place", "places")
             yield f"damaged: {recording.lost_bytes} bytes in {where} cannot be read; `steadypose repair` saves the rest"
         for topic in recording.topics:
-            rate = Rate.of(contents[topic].times)
+            rate = Rate(contents[topic].times)
             yield f"{topic}: {wire_type(TOPICS[topic])}"
             yield f"    {plural(rate.count, 'message', 'messages')}{rate.brief}"
             yield f"    {contents[topic]}"
@@ -174,7 +174,7 @@ def describe_file(path: Path) -> Iterator[str]:
                 if (there := np.isfinite(body.positions).all(axis=-1)).any():
                     ids.add(body.id)
                     seen.append(there.mean())
-    rate = Rate.of(stamps)
+    rate = Rate(stamps)
     share = f"{np.mean(seen):.0%} of their joints observed" if seen else "nobody in any frame"
     yield f"{rate.count} frames{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
     yield f"body ids {', '.join(map(str, sorted(ids))) or 'none'}; {share}"

@@ -10,8 +10,8 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -122,7 +122,7 @@ def echo(
     """
     left = sys.maxsize if count is None else count
     for topic, message in messages_of(target, topics, launch, endpoints, newest=True):
-        lines = _yaml(topic, message).split("\n") if full else _lines(topic, message)
+        lines = ["---", f"topic: {topic}", *_fields(message, "")] if full else _lines(topic, message)
         print("\n".join(map(printable, lines)), flush=target in TOPICS)
         left -= 1
         if left <= 0:
@@ -170,10 +170,6 @@ def _lines(topic: str, message: Message) -> Iterator[str]:
 
 def _vector(values: NDArray[np.floating]) -> str:
     return "(" + ", ".join(f"{value:.2f}" for value in values) + ") m"
-
-
-def _yaml(topic: str, message: Message) -> str:
-    return "\n".join(["---", f"topic: {topic}", *_fields(message, "")])
 
 
 def _fields(record: Any, indent: str) -> Iterator[str]:
@@ -249,7 +245,7 @@ def hz(
         for topic, message in messages_of(target, topics, launch, endpoints):
             stamps.setdefault(topic, []).append(message.stamp_ns / 1e9)
         for topic, found in stamps.items():
-            print(f"{topic}: {Rate.of(found[:count])}")
+            print(f"{topic}: {Rate(found[:count])}")
         return
     with subscribe(target, launch, endpoints) as subscriber:
         arrivals = (time.monotonic() for _ in receive(subscriber, target))
@@ -260,26 +256,20 @@ def hz(
             print(f"{rate}" + (f" lost: {missed}" if missed else ""), flush=True)
 
 
-@dataclass(frozen=True)
 class Rate:
-    """How often something came: mean rate in Hz, and the intervals between in seconds."""
+    """How often something came: mean rate in Hz, and the intervals between in seconds; NaN for fewer than two times.
 
-    mean_hz: float
-    shortest_s: float
-    longest_s: float
-    deviation_s: float
-    count: int
-    """things that came"""
+    Args:
+        times: in seconds, in the order they came.
+    """
 
-    @classmethod
-    def of(cls, times: list[float] | deque[float]) -> Rate:
-        """Of times in seconds, in the order they came; NaN for fewer than two."""
-        steps = np.diff(np.array(times))
-        if not len(steps):
-            return cls(np.nan, np.nan, np.nan, np.nan, len(times))
+    def __init__(self, times: Sequence[float]) -> None:
+        steps = np.diff(np.array(times)) if len(times) > 1 else np.array([np.nan])
         span = float(steps.sum())
-        mean = len(steps) / span if span > 0 else np.nan
-        return cls(mean, float(steps.min()), float(steps.max()), float(steps.std()), len(times))
+        self.count = len(times)
+        self.mean_hz = len(steps) / span if span > 0 else np.nan
+        self.shortest_s, self.longest_s = float(steps.min()), float(steps.max())
+        self.deviation_s = float(steps.std())
 
     @property
     def brief(self) -> str:
@@ -309,6 +299,6 @@ def measure(arrivals: Iterator[float], window_s: float, count: int | None = None
             break
         if now - reported_at >= HZ_EVERY_S:
             reported_at = now
-            yield Rate.of(recent)
+            yield Rate(recent)
     if recent and recent[-1] != reported_at:
-        yield Rate.of(recent)
+        yield Rate(recent)

@@ -188,20 +188,17 @@ def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch],
 
 
 @pytest.mark.parametrize(
-    "settings",
+    "told",
     [
-        {"input__calibration__position": "[1.0, 2.0]"},
-        {"input__calibration__position": "[1.0, 2.0, 3.0]"},
-        {"input__calibration__position": "[0.0, 0.0, 1.0]", "input__calibration__orientation": "[0.0, 0.0, 0.0, 2.0]"},
-        {"input__calibration__position": "[nan, 0.0, 1.0]", "input__calibration__orientation": "[0.0, 0.0, 0.0, 1.0]"},
-        {"input__calibration__size": "[640, 360]"},
-        {
-            "input__calibration__size": "[640, 360]",
-            "input__calibration__focal": "[0.0, 500.0]",
-            "input__calibration__centre": "[320.0, 180.0]",
-        },
+        "position = [1.0, 2.0]",
+        "position = [1.0, 2.0, 3.0]",
+        "position = [0.0, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 2.0]",
+        "position = [nan, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 1.0]",
+        "size = [640, 360]",
+        "size = [640, 360]\nfocal = [0.0, 500.0]\ncentre = [320.0, 180.0]",
     ],
 )
-def test_a_calibration_that_cannot_be_is_refused(make_launch: Callable[..., Launch], settings: dict[str, str]) -> None:
+def test_a_calibration_that_cannot_be_is_refused(told: str, tmp_path: Path) -> None:
+    (tmp_path / "kitchen.toml").write_text(f"[input.calibration]\n{told}\n")
     with pytest.raises(LaunchError, match=r"input\.calibration"):
-        make_launch(**settings)
+        Launch.read(tmp_path / "kitchen.toml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -111,11 +112,11 @@ def test_hz_of_a_topic_ends_after_its_count(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_rate_of_uneven_times() -> None:
-    rate = Rate.of([0.0, 0.1, 0.2, 0.5])
+    rate = Rate([0.0, 0.1, 0.2, 0.5])
     assert rate.mean_hz == pytest.approx(6.0)
     assert (rate.shortest_s, rate.longest_s) == (pytest.approx(0.1), pytest.approx(0.3))
     assert rate.deviation_s == pytest.approx(np.std([0.1, 0.1, 0.3]))
-    assert np.isnan(Rate.of([1.0]).mean_hz)
+    assert np.isnan(Rate([1.0]).mean_hz)
 
 
 def test_measuring_tells_once_a_second_and_looks_back_no_further_than_the_window() -> None:
@@ -146,7 +147,7 @@ def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
     endpoint, silent = f"ipc://{tmp_path}/input", f"ipc://{tmp_path}/nobody"
     assert published(endpoint, lambda: info(POSE_RAW, endpoints=(endpoint, silent))) == 0
     out = capsys.readouterr().out
-    assert f"{endpoint}: " in out
+    assert re.search(rf"{endpoint}: \d+ messages in 0.5 s, [1-9][\d.]+ Hz, longest gap \d+ ms", out)
     assert "skeleton azure_kinect32" in out
     assert f"{silent}: 0 messages" in out
     assert info(POSE_RAW, endpoints=(silent,)) == 1
