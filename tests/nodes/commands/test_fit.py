@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pytest
@@ -13,26 +11,11 @@ from tests.helpers.smpl_model import model_arrays
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
+from steadypose.msgs.types import PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.key_points import read_key_points
 from steadypose.nodes.sources.npz import NpzError
-from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.fit import solve
-from steadypose.prior.fit.bodies import (
-    Fit,
-    bodies_seen,
-    fit_body,
-    ground_plane,
-    lowest_floor,
-    noise_of,
-    rewritten,
-    stands_elsewhere,
-    track_of,
-)  # fmt: skip
-from steadypose.prior.fit.humor_network import HumorNet
-from steadypose.prior.fit.observations import SeenJoints
 from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.mocap.files import read_amass
 
@@ -204,79 +187,3 @@ def test_key_points_are_put_on_the_grid(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.pixels[::2][5], told["keypoints"][5], atol=0.1)
     np.testing.assert_allclose(found.pixels[1], (told["keypoints"][0] + told["keypoints"][1]) / 2, atol=0.1)
     assert found.confidence[6, 4] == 0.0
-
-
-def test_noise_is_found_in_what_moves() -> None:
-    rng = np.random.default_rng(0)
-    t = np.arange(90)[:, None, None] / 30
-    moving = np.sin(2 * t) + np.zeros((90, 22, 3))
-    assert noise_of(moving + 0.04 * rng.standard_normal((90, 22, 3))) == pytest.approx(0.04, rel=0.1)
-    assert noise_of(moving) == pytest.approx(0.01)
-    assert noise_of(np.full((90, 22, 3), np.nan)) == pytest.approx(0.01)
-
-
-def test_the_plane_of_the_ground_holds_its_points() -> None:
-    plane = ground_plane(np.array([0.2, 0.05, -0.03]))
-    assert plane @ [0.0, 0.0, 0.2, 1.0] == pytest.approx(0.0)
-    assert np.linalg.norm(plane[:3]) == pytest.approx(1.0)
-
-
-def seen_body(frames: int = 12) -> list[tuple[str, PoseClean]]:
-    """A body at rest, as ``pose/clean`` says it, in messages."""
-    still = REST_POSITIONS + [0.0, 0.0, 0.9]
-    body = CleanBody(
-        id=7, positions=still, rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)), state=np.full(22, JointState.REFINED),
-        sigma=np.full(22, 0.01), anomaly=0.0, anomaly_flag=False, joint_anomaly=np.zeros(22),
-        bone_lengths=np.ones(22), raw_positions=still, raw_confidence=np.ones(22),
-    )  # fmt: skip
-    return [
-        (POSE_CLEAN, PoseClean(round(t * FRAME_NS), "camera", "test", Pose.identity(), True, 4, [replace(body)]))
-        for t in range(frames)
-    ]
-
-
-def test_a_body_that_was_away_or_not_whole_is_two() -> None:
-    messages = seen_body(30)
-    messages[14][1].bodies = []
-    assert [len(seen.bodies) for seen in bodies_seen(messages, 8)] == [14, 15]
-    broken = seen_body(30)
-    broken[10][1].bodies[0].positions = np.full((22, 3), np.nan, np.float32)
-    assert [len(seen.bodies) for seen in bodies_seen(broken, 8)] == [10, 19]
-    assert bodies_seen(broken, 25) == []
-
-
-def test_what_clean_has_moved_far_is_not_believed() -> None:
-    messages = seen_body()
-    jumped = messages[3][1].bodies[0].raw_positions.copy()
-    jumped[20] += 0.5
-    messages[3][1].bodies[0].raw_positions = jumped
-    observed = track_of(bodies_seen(messages, 8)[0], None).observed[0]
-    assert isinstance(observed, SeenJoints)
-    hidden = np.asarray(~np.isfinite(observed.positions.numpy()).all(axis=-1))
-    assert hidden.sum() == 1
-    assert hidden[3, 20]
-
-
-def test_who_stands_on_stairs_is_not_fitted_to_a_floor() -> None:
-    positions = np.tile(REST_POSITIONS - [0.0, 0.0, REST_POSITIONS[10, 2] - 0.02], (60, 1, 1))
-    steps = 0.17 * (np.arange(60) // 12)[:, None]
-    assert not stands_elsewhere(positions, 0.0)
-    assert not stands_elsewhere(positions + [0.0, 0.0, 0.3], lowest_floor(positions + [0.0, 0.0, 0.3]))
-    climbing = positions.copy()
-    climbing[..., 2] += steps
-    assert stands_elsewhere(climbing, lowest_floor(climbing))
-    messages = seen_body()
-    for t, (_, message) in enumerate(messages):
-        message.bodies[0].positions = message.bodies[0].positions + np.array([0.0, 0.0, 0.3 * (t > 4)])
-    fit = fit_body(cast(HumorNet, None), bodies_seen(messages, 8)[0], None, FitSettings(), None)
-    assert fit.track is None
-
-
-def test_a_fit_that_fails_leaves_clean_and_is_flagged() -> None:
-    messages = seen_body()
-    seen = bodies_seen(messages, 8)[0]
-    out = rewritten(messages, [Fit(seen, None, np.zeros((12, 22)))])
-    for (_, before), (_, after) in zip(messages, out, strict=True):
-        assert isinstance(after, PoseClean)
-        np.testing.assert_array_equal(after.bodies[0].positions, before.bodies[0].positions)
-        assert after.bodies[0].anomaly_flag
