@@ -3,7 +3,8 @@
 A part with a setting is switched off by it. The whole-body experts and the multiple-model estimate's weight in white
 noise have none and are replaced in place. The trajectory's parts are ablated after the default prior, in
 time-correlated noise of 2 cm, with a known floor. Errors are means over people, relative to what ships, paired by clip
-(`benchmarks.intervals`). Cost is measured on one body with a hidden arm, a frame at a time, so that every part has
+(`benchmarks.intervals`). Some parts move no joint but decide what is flagged: their table has false alarms, and faults
+that are found. Cost is measured on one body with a hidden arm, a frame at a time, so that every part has
 work.
 """
 
@@ -30,6 +31,7 @@ from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
+from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.benchmarks.workload import numpy_ms
 from steadypose.prior.arrays import Floats
@@ -103,6 +105,22 @@ CONDITIONS: Mapping[str, Condition] = {
 }
 """Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
 
+FLAGGING = (
+    AS_IT_SHIPS,
+    "without the gate",
+    "without slow error",
+    "without HG-VAE's denoising",
+    "without the person's bones",
+    "without the score",
+)
+"""Parts that flags may depend on."""
+
+SOUND = ("1 cm", "lasting 2 cm")
+"""Conditions without a fault."""
+
+FAULTY = ("arms exchanged", "legs exchanged", "left taken for right", "another skeleton", "another person's arm")
+"""Faults of the tracker, in addition to time-correlated noise of 2 cm."""
+
 
 def run(bench: Bench) -> Result:
     """Measure the prior without each part in every condition, then the trajectory."""
@@ -118,14 +136,40 @@ def run(bench: Bench) -> Result:
             found = score(answer, clips.positions, hidden, align=False)
             errors = found.hidden if hidden.any() else found.position
             records.append(_record(condition, name, errors, found.acceleration_error))
+    flags = _flags(bench, clips)
     world, world_cost = _world(bench, clips), world_costs(clips)
     tables = [
         _table("ablations", "What each part is worth: error of joints", "mm", records, cost, clips),
         _table("ablations-acceleration", "The same of acceleration error", "acceleration_mm", records, cost, clips),
+        _flags_table(flags, cost, clips),
         _table("ablations-world", "The world's parts: joints and standing feet", "mm", world, world_cost, clips),
     ]
-    data = {"person": clips.person.tolist(), "data_set": clips.data_set.tolist(), "records": records, "world": world}
+    data = {
+        "person": clips.person.tolist(),
+        "data_set": clips.data_set.tolist(),
+        "records": records,
+        "flags": flags,
+        "world": world,
+    }
     return Result(tables, {"data": clips.source, **data, "ms": cost, "world ms": world_cost})
+
+
+def _flags(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
+    """Measure the percentage of frames flagged without a fault, and of clips flagged while they have one."""
+    noisy = correlated(clips.positions, 0.02, np.random.default_rng(0))
+    records = []
+    for condition in (*SOUND, *FAULTY):
+        rng, has_fault = np.random.default_rng(0), np.ones(len(clips.offsets), dtype=bool)
+        if condition in SOUND:
+            seen = noisy_joints.CONDITIONS[condition](clips.positions, rng)
+        else:
+            windows, has_fault = FAULTS[condition](noisy.swapaxes(0, 1), rng)
+            seen = windows.swapaxes(0, 1)
+        for name in bench.progress.track(FLAGGING, description=condition):
+            flagged = product.run(PARTS[name].settings, seen, clips.stamps_s, DELAY).flagged[:, has_fault]
+            share = flagged if condition in SOUND else flagged[BEGINS:].any(axis=0)
+            records.append({"condition": condition, "method": name, "percent": round(100 * float(share.mean()), 2)})
+    return records
 
 
 def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
@@ -186,6 +230,23 @@ def _record(condition: str, name: str, errors: Floats, acceleration: Floats) -> 
         "condition": condition, "method": name,
         **{key: np.round(1e3 * values, 3).tolist() for key, values in by_clip.items()},
     }  # fmt: skip
+
+
+def _flags_table(records: Sequence[Mapping[str, Any]], cost: Mapping[str, float], clips: MotionClips) -> Table:
+    """Build a table with a row for each part that flags may depend on."""
+    percent = {(record["method"], record["condition"]): record["percent"] for record in records}
+    rows = []
+    for name in FLAGGING:
+        spent = f"{cost[name] - cost[AS_IT_SHIPS]:+.2f}" if name != AS_IT_SHIPS else f"{cost[name]:.2f}"
+        alarms, found = ([percent[name, condition] for condition in group] for group in (SOUND, FAULTY))
+        rows.append([name, *(f"{share:.1f}" for share in alarms), *(f"{share:.0f}" for share in found), spent])
+    note = (
+        f"{len(clips.offsets)} clips of {FRAMES} frames, delay {DELAY}. False alarms: percentage of frames. Faults: in "
+        f"noise that lasts, 2 cm, from frame {BEGINS} on or in the whole clip; percentage of clips with the fault that "
+        f"are flagged after frame {BEGINS}."
+    )
+    columns = ["", *(f"false alarms, {name}" for name in SOUND), *FAULTY, "ms a frame"]
+    return Table("ablations-flags", f"What flags depend on, delay {DELAY}", columns, rows, note)
 
 
 def _table(
