@@ -113,7 +113,7 @@ class Fuse:
                 _complete(body, imputed.positions[slots], seen, unseen, hidden, precision.seen)
                 completed_sigma = np.where(hidden, imputed.sigma[slots], np.inf)
             occluded = self.occluded.update(
-                slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma, track
+                slots, seen, deviation, unseen, seen_later[slots], body, completed_sigma, offsets, track
             )
             if occluded is not None:
                 row, joint = occluded.joints.T
