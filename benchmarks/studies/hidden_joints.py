@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures
+from steadypose.benchmarks.baselines.banks import whole_body_bank
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import BASELINES, Baseline
 from steadypose.benchmarks.baselines.whole_body_kalman import whole_body_kalman
@@ -34,7 +35,7 @@ from steadypose.benchmarks.studies.corrupted import (
     run_conditions,
 )
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import limbs
+from steadypose.prior.body.skeleton import HIPS, SHOULDERS, limbs
 from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = VARIANTS
@@ -91,7 +92,7 @@ def run(bench: Bench) -> Result:
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
     baselines = (
         *BASELINES,
-        Baseline(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0,)),
+        Baseline(GAUSSIAN, partial(given_the_seen, gaussian=gaussian), (0, 4), whole_body=True),
         Baseline(FILTER, whole_body_kalman, (0,), {"density": (0.1, 50.0), "damping": (1.0, 30.0)}, whole_body=True),
     )
     data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, baselines)
@@ -100,7 +101,8 @@ def run(bench: Bench) -> Result:
         f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
         f"the first {SEEN_FIRST} frames of a clip are seen in full. A duration: one lower arm or leg is away for so "
         f"long. Never: knees and all below them, or an arm, in no frame of a clip. {GAUSSIAN}: the mean of what is "
-        f"hidden given what is seen, of one Gaussian over training poses; without hips and shoulders, {BESIDE}. {HOW}"
+        f"hidden given what the whole-body bank makes of what is seen, of one Gaussian over training poses; where "
+        f"neither hips nor shoulders are seen, {BESIDE}. {HOW}"
     )
     sources = by_source(records, "hidden", 4, clips, "hidden_joints-sources", "Hidden joints: their error")
     groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
@@ -132,10 +134,17 @@ def run(bench: Bench) -> Result:
 
 
 def given_the_seen(seen: Floats, stamps_s: Floats, delay: int, gaussian: ConditionalGaussian) -> Floats:
-    """Return the input, with a hidden joint at its conditional mean, or held in the body frame where the body's heading
-    is unknown."""
-    found = gaussian(seen)
-    return np.where(np.isfinite(found), found, beside(seen, stamps_s, delay))
+    """Return the input, smoothed by the whole-body bank, with a hidden joint at its conditional mean.
+
+    The heading is that of hips and shoulders, or of those of them that are seen. Where it is unknown, a hidden joint is
+    held in the body frame.
+    """
+    smooth = np.where(np.isfinite(seen), whole_body_bank(seen, stamps_s, delay), np.nan)
+    across = np.stack([smooth[..., left, :] - smooth[..., right, :] for left, right in (HIPS, SHOULDERS)])
+    known = np.isfinite(across).all(axis=-1).any(axis=0)
+    x, y, _ = np.moveaxis(np.nansum(across, axis=0), -1, 0)
+    found = gaussian(smooth, yaw=np.where(known, np.arctan2(-x, y), np.nan))
+    return np.where(np.isfinite(found), found, beside(smooth, stamps_s, delay))
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:

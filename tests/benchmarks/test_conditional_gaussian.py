@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from steadypose.benchmarks.baselines.body import ConditionalGaussian
+from steadypose.benchmarks.studies.hidden_joints import given_the_seen
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 
@@ -60,3 +61,15 @@ def test_a_heading_that_is_given_does_without_hips_and_shoulders(gaussian: Condi
     seen = truth.copy()
     seen[:, anchors] = np.nan
     np.testing.assert_allclose(gaussian(seen, np.array([0.3, 2.0])), truth, atol=5e-3)
+
+
+def test_one_shoulder_and_both_hips_give_a_heading_and_without_any_a_joint_is_held_beside_the_body() -> None:
+    gaussian, turn = ConditionalGaussian(poses(20_000, 0)), yaw_matrix(np.array([0.3, 2.0]))
+    truth = np.tile(np.einsum("nab,jb->nja", turn, REST_POSITIONS), (12, 1, 1, 1))
+    seen = truth.copy()
+    seen[:, :, [J["left_shoulder"], ELBOW, WRIST]] = np.nan
+    found = given_the_seen(seen, np.arange(12) / 30, 4, gaussian)
+    np.testing.assert_allclose(found, truth, atol=5e-3)
+    seen[6:, :, [J["right_hip"], J["right_shoulder"]]] = np.nan
+    found = given_the_seen(seen, np.arange(12) / 30, 4, gaussian)[:, :, J["right_shoulder"]]
+    np.testing.assert_allclose(found, truth[:, :, J["right_shoulder"]], atol=5e-3)

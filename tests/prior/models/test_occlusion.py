@@ -13,10 +13,11 @@ from tests.helpers.bodies import waving
 from steadypose.benchmarks.baselines.body import beside, facing
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import PARENT, J
 from steadypose.prior.clean.occluded import DENSITIES, FIRST_SPEED, OccludedJoints, Track, bridge
 from steadypose.prior.models.occlusion.candidates import FEATURES, STANDING
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
+from steadypose.prior.models.posture import LivePosture
 from steadypose.training.recipes.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
 
@@ -57,6 +58,11 @@ def without_gaps(bodies: int = 1) -> Track:
     return Track(np.full((2, bodies, 22, 3), np.nan), 0, np.full(bodies, 0.005))
 
 
+def bones(frame: Floats) -> Floats:
+    """(B, 22, 3) metres: from each joint's parent to it, in a body like this frame's."""
+    return frame - frame[:, PARENT]
+
+
 def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
     """The rows of every frame, of joints that coast where they were last seen, and are completed as they truly are."""
     bodies = truth.shape[1]
@@ -69,8 +75,9 @@ def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
         sigma = 0.005 + unseen
         again = np.zeros(gone.shape, dtype=bool)
         joints.update(
-            np.arange(bodies), place, sigma, unseen, again, frame, np.full(sigma.shape, 0.03), without_gaps(bodies)
-        )
+            np.arange(bodies), place, sigma, unseen, again, frame, np.full(sigma.shape, 0.03), bones(frame),
+            without_gaps(bodies),
+        )  # fmt: skip
     return asked.rows
 
 
@@ -102,44 +109,52 @@ def test_of_a_frame_lost_whole_nothing_is_asked() -> None:
     assert not asked_of(truth, hidden)
 
 
-def test_a_joint_never_seen_is_halfway_from_its_completion_on_average_to_a_standing_body_and_goes_with_it() -> None:
+LEG = [J[f"left_{name}"] for name in ("knee", "ankle", "foot")]
+
+
+@pytest.mark.parametrize(("limb", "share"), [(ARM, 0.5), (LEG, 0.0)])
+def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_goes_with_the_body(
+    limb: list[int], share: float
+) -> None:
+    """Completion and standing body count the same; an arm is also half the expectation of the observed joints."""
     truth, rng, joints = walking(), np.random.default_rng(0), OccludedJoints("default", 1)
-    joints.weigher = asked = Asked()
+    joints.weigher, posture = (asked := Asked()), LivePosture.load("default")
     unseen, sigma, off = np.zeros((1, 22)), np.full((1, 22), 0.005), []
-    unseen[:, ARM], sigma[:, ARM] = np.inf, np.inf
+    unseen[:, limb], sigma[:, limb] = np.inf, np.inf
     for frame in truth:
         seen, completed = frame.copy(), frame + 0.02 * rng.standard_normal(frame.shape)
-        seen[:, ARM] = np.nan
+        seen[:, limb] = np.nan
         answer = joints.update(
             np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), completed, np.full((1, 22), 0.03),
-            without_gaps(),
+            bones(frame), without_gaps(),
         )  # fmt: skip
         assert answer is not None
-        assert answer.joints.tolist() == [[0, joint] for joint in ARM]
-        np.testing.assert_array_equal(answer.sigma, 0.03)
-        yaw = facing(frame)
-        standing = frame[0, ELBOW_AT] + (STANDING[ARM] - STANDING[ELBOW_AT]) @ yaw_matrix(yaw)[0].T
-        off.append(answer.positions - 0.5 * (frame[0, ARM] + standing))
+        assert answer.joints.tolist() == [[0, joint] for joint in limb]
+        above = PARENT[limb[0]]
+        standing = frame[0, above] + (STANDING[limb] - STANDING[above]) @ yaw_matrix(facing(frame))[0].T
+        expected = posture(frame, sigma, bones(frame)).positions[0, limb]
+        off.append(answer.positions - (1.0 - share) * 0.5 * (frame[0, limb] + standing) - share * expected)
     assert not asked.rows
     np.testing.assert_allclose(off[10:], 0.0, atol=0.05)
     shake = np.diff(off[10:], axis=0).std()
     assert shake < 0.01, "of 0.028, what differs from frame to frame in the completion"
 
 
-def test_a_leg_that_was_never_seen_is_stated_a_fifth_less_sure_and_one_seen_in_part_is_not() -> None:
+def test_limbs_that_were_never_seen_are_stated_less_sure_and_those_seen_in_part_are_not() -> None:
     joints, standing = OccludedJoints("default", 1), waving(1)
     joints.weigher = Asked()
-    left, part = [J[f"left_{name}"] for name in ("knee", "ankle", "foot")], [J["right_ankle"], J["right_foot"]]
+    arm, part = [J[f"right_{name}"] for name in ("shoulder", "elbow", "wrist")], [J["right_ankle"], J["right_foot"]]
     unseen, sigma, seen = np.zeros((1, 22)), np.full((1, 22), 0.005), standing.copy()
-    for gone in (left, part, ARM[1:]):
+    for gone in (LEG, arm, part, ARM[1:]):
         unseen[:, gone], sigma[:, gone], seen[:, gone] = np.inf, np.inf, np.nan
     answer = joints.update(
         np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), standing, np.full((1, 22), 0.05),
-        without_gaps(),
+        bones(standing), without_gaps(),
     )  # fmt: skip
     assert answer is not None
     stated = dict(zip(answer.joints[:, 1].tolist(), answer.sigma.tolist(), strict=True))
-    expected = {joint: 0.06 if joint in left else 0.05 for joint in sorted((*left, *part, ARM[1]))}
+    expected = dict.fromkeys(sorted((*LEG, *arm, *part, ARM[1])), 0.05) | dict.fromkeys(LEG, 0.07)
+    expected |= dict.fromkeys(arm[1:], 0.08)
     assert stated == {joint: pytest.approx(value) for joint, value in expected.items()}
 
 
@@ -150,7 +165,7 @@ def test_what_was_last_seen_is_forgotten_until_the_completions_deviation_is_stat
         unseen[:, ARM] = second
         answer = joints.update(
             np.arange(1), standing, 0.003 + 0.1 * unseen, unseen, np.zeros((1, 22), dtype=bool), standing,
-            np.full((1, 22), 0.1), without_gaps(),
+            np.full((1, 22), 0.1), bones(standing), without_gaps(),
         )  # fmt: skip
         if second:
             assert answer is not None
@@ -216,7 +231,7 @@ def test_what_ships_believes_a_foot_that_stands_more_than_its_completion() -> No
         sigma = 0.003 + 0.1 * unseen
         answer = joints.update(
             np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1),
-            without_gaps(),
+            bones(standing), without_gaps(),
         )  # fmt: skip
         assert answer is not None
         if len(answer.joints):
