@@ -94,7 +94,7 @@ def joint_angles(links: Links) -> dict[str, float]:
     def between(parent: str, child: str) -> Floats:
         return links[parent][1].T @ links[child][1]
 
-    roll, yaw, pitch = _xzy(between("torso", "head"))
+    roll, yaw, pitch = _euler("XZY", between("torso", "head"))
     angles = {"waist": _about_y(between("body", "torso")), "r_head": roll, "y_head": yaw, "p_head": -pitch}
     for side, sign in (("l", 1.0), ("r", -1.0)):
         first, raised, last = _zxz(between("torso", f"{side}_shoulder"), sign)
@@ -102,7 +102,7 @@ def joint_angles(links: Links) -> dict[str, float]:
         angles[f"{side}_p_shoulder"] = sign * raised
         angles[f"{side}_r_shoulder"] = sign * last
         angles[f"{side}_elbow"] = -_about_y(between(f"{side}_shoulder", f"{side}_elbow"))
-        yaw, spread, swing = _zxy(between("body", f"{side}_hip"))
+        yaw, spread, swing = _euler("ZXY", between("body", f"{side}_hip"))
         angles[f"{side}_y_hip"] = -yaw
         angles[f"{side}_p_hip"] = sign * spread
         angles[f"{side}_r_hip"] = -swing
@@ -115,16 +115,9 @@ def _about_y(turn: Floats) -> float:
     return float(np.arctan2(turn[0, 2] - turn[2, 0], turn[0, 0] + turn[2, 2]))
 
 
-def _xzy(turn: Floats) -> tuple[float, float, float]:
-    """Angles a, b, c of Rx(a) Rz(b) Ry(c), radians."""
-    b = np.arcsin(np.clip(-turn[0, 1], -1.0, 1.0))
-    return float(np.arctan2(turn[2, 1], turn[1, 1])), float(b), float(np.arctan2(turn[0, 2], turn[0, 0]))
-
-
-def _zxy(turn: Floats) -> tuple[float, float, float]:
-    """Angles a, b, c of Rz(a) Rx(b) Ry(c), radians."""
-    b = np.arcsin(np.clip(turn[2, 1], -1.0, 1.0))
-    return float(np.arctan2(-turn[0, 1], turn[1, 1])), float(b), float(np.arctan2(-turn[2, 0], turn[2, 2]))
+def _euler(axes: str, turn: Floats) -> list[float]:
+    """Angles about the axes, such as a, b, c of Rx(a) Rz(b) Ry(c) for ``XZY``, radians."""
+    return Rotation.from_matrix(turn).as_euler(axes).tolist()
 
 
 def _zxz(turn: Floats, sign: float) -> tuple[float, float, float]:
