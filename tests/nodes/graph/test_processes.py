@@ -3,97 +3,29 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import record, until, walk
+from runs import INPUT_ALONE, Run, runs
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.graph.run_state import HEALTH_FILE
 from steadypose.nodes.sources.pose_input import LOOP_PAUSE_NS
 
 pytestmark = pytest.mark.slow
 
-INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
-
-
-class Run:
-    """`steadypose run` in a process, and what it says of itself.
-
-    Args:
-        folder: of its sockets.
-        arguments: of the command.
-    """
-
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self._health = folder / "steadypose" / HEALTH_FILE
-        self._output = (folder / "output").open("w+")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "steadypose.nodes.cli", "run", *arguments],
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-        )
-
-    def nodes(self) -> dict[str, Any]:
-        try:
-            return json.loads(self._health.read_text())["nodes"]
-        except FileNotFoundError:
-            return {}
-
-    def node(self, name: str) -> dict[str, Any]:
-        return self.nodes().get(name, {"state": "unknown", "restarts": -1})
-
-    def until_running(self, *names: str, timeout_s: float = 240.0) -> None:
-        until(lambda: all(self.node(name)["state"] == "running" for name in names), timeout_s=timeout_s)
-
-    def pid(self, name: str) -> int:
-        for child in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split():
-            if f"\0node\0{name}\0" in Path(f"/proc/{child}/cmdline").read_text():
-                return int(child)
-        raise AssertionError(f"{name} does not run")
-
-    def kill(self, name: str, with_: signal.Signals = signal.SIGKILL) -> None:
-        before = self.node(name)["restarts"]
-        os.kill(self.pid(name), with_)
-        until(lambda: self.node(name)["restarts"] > before, timeout_s=60)
-
-    def end(self) -> tuple[int, str]:
-        self.process.send_signal(signal.SIGINT)
-        return self.wait()
-
-    def wait(self, timeout_s: float = 240.0) -> tuple[int, str]:
-        status = self.process.wait(timeout_s)
-        self._output.seek(0)
-        return status, self._output.read()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        self._output.close()
-
 
 @pytest.fixture
-def start(folder: Path) -> Iterator[Any]:
-    runs: list[Run] = []
-
-    def start(*arguments: str) -> Run:
-        runs.append(Run(folder, *arguments))
-        return runs[-1]
-
-    yield start
-    for run in runs:
-        run.close()
+def start(folder: Path) -> Iterator[Callable[..., Run]]:
+    with runs(folder) as start:
+        yield start
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from conftest import record, running, until, walk
-from test_processes import INPUT_ALONE, Run
+from runs import INPUT_ALONE, Run, runs
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
@@ -31,21 +31,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def begin(folder: Path) -> Iterator[Callable[..., Run]]:
-    runs: list[Run] = []
-
-    def begin(*arguments: str, beside: bool = False) -> Run:
-        where = folder
-        if beside:  # its output goes elsewhere, its sockets to the same directory
-            where = folder / "beside"
-            where.mkdir()
-            (where / "steadypose").symlink_to(folder / "steadypose")
-        runs.append(Run(where, *arguments))
-        return runs[-1]
-
-    yield begin
-    for run in runs:
-        run.close()
+def start(folder: Path) -> Iterator[Callable[..., Run]]:
+    with runs(folder) as start:
+        yield start
 
 
 @pytest.fixture
@@ -65,10 +53,10 @@ def test_nohup_is_obeyed() -> None:
             signal.signal(number, handler)
 
 
-def test_a_second_run_is_refused_and_the_first_is_left_alone(begin: Any, recording: Path, folder: Path) -> None:
-    first: Run = begin("--input", str(recording), "--loop", *INPUT_ALONE)
+def test_a_second_run_is_refused_and_the_first_is_left_alone(start: Any, recording: Path, folder: Path) -> None:
+    first: Run = start("--input", str(recording), "--loop", *INPUT_ALONE)
     first.until_running("pose_input")
-    second: Run = begin("--input", str(recording), *INPUT_ALONE, beside=True)
+    second: Run = start("--input", str(recording), *INPUT_ALONE, beside=True)
     status, output = second.wait()
     assert status == 2
     assert f"pose_input runs already at ipc://{folder}" in output.replace("/beside", "")
@@ -83,16 +71,10 @@ def test_locks_are_of_addresses_and_go_with_their_holder(
     folder: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder / "runtime"))
-    tcp = 'transport.endpoints={prior="tcp://127.0.0.1:7199"}'
-    source, prior = (
-        make_launch(nodes='["pose_input"]'),
-        make_launch({tcp.partition("=")[0]: tcp.partition("=")[2]}, nodes='["prior"]'),
-    )
-    elsewhere = make_launch(
-        {"transport.endpoints": '{prior="tcp://127.0.0.1:7199"}'},
-        nodes='["prior"]',
-        transport__directory=folder / "other",
-    )
+    tcp = '{prior="tcp://127.0.0.1:7199"}'
+    source = make_launch(nodes='["pose_input"]')
+    prior = make_launch(nodes='["prior"]', transport__endpoints=tcp)
+    elsewhere = make_launch(nodes='["prior"]', transport__endpoints=tcp, transport__directory=folder / "other")
     with RunLock(source) as first:
         assert first.has_health
         with RunLock(prior) as beside:
@@ -107,40 +89,35 @@ def test_locks_are_of_addresses_and_go_with_their_holder(
         pass
 
 
-def test_a_damaged_recording_is_played_and_the_exit_status_says_so(begin: Any, recording: Path) -> None:
+def test_a_damaged_recording_is_played_and_the_exit_status_says_so(start: Any, recording: Path) -> None:
     (file,) = recording.glob("*.mcap")
     data = bytearray(file.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 2000] = bytes(2000)
     file.write_bytes(data)
-    run: Run = begin("--input", str(recording), *INPUT_ALONE)
+    run: Run = start("--input", str(recording), *INPUT_ALONE)
     status, output = run.wait()
     assert status == 1, output
     assert "the readable part of the input was played" in output.splitlines()[-1]
 
 
-def test_poses_go_on_where_the_log_cannot_be_written(begin: Any, recording: Path, tmp_path: Path, folder: Path) -> None:
+def test_poses_go_on_where_the_log_cannot_be_written(recording: Path, tmp_path: Path, folder: Path) -> None:
     out = tmp_path / "out"
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
-    command = [sys.executable, "-P", "-m", "steadypose.nodes.cli"] if sys.version_info >= (3, 11) else [
-        sys.executable, "-m", "steadypose.nodes.cli"
-    ]  # fmt: skip
     arguments = ["run", "--input", recording, "--record", out, *INPUT_ALONE, "--set", "recorder.free_mb=0"]
+    command = [sys.executable, "-m", "steadypose.nodes.cli", *arguments]
     with open("/dev/full", "w") as full:
-        status = subprocess.run(
-            [*command, *arguments], stdout=full, stderr=full, env=environment, timeout=240
-        ).returncode
-    assert status == 0
+        assert subprocess.run(command, stdout=full, stderr=full, env=environment, timeout=240).returncode == 0
     with RecordingReader(out) as reader:
         assert reader.count(POSE_RAW) == 91
 
 
-def test_a_path_may_hold_any_character(begin: Any, tmp_path: Path) -> None:
+def test_a_path_may_hold_any_character(start: Any, tmp_path: Path) -> None:
     strange = tmp_path / 'a 😀 "b\x7f'
     strange.mkdir()
     source = record(strange / "in", walk(30))
     out = strange / "out"
-    run: Run = begin(
+    run: Run = start(
         "--input", str(source), "--record", str(out), "--rate", "0", *INPUT_ALONE, "--set", "recorder.free_mb=0"
     )
     status, output = run.wait()
