@@ -297,12 +297,6 @@ def test_a_sourced_rclpy_finds_what_it_imports() -> None:
     assert {"numpy", "pyyaml"} <= set(done.stdout.split()) <= brought
 
 
-@pytest.mark.parametrize("frame", ["", "/map"])
-def test_a_frame_that_ros_does_not_take(frame: str) -> None:
-    with pytest.raises(LaunchError, match="without a slash"):
-        Ros2BridgeSettings(world_frame=frame)
-
-
 @pytest.fixture(params=["dds", "rclpy"])
 def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Connection]]:
     """Each way into ROS."""

@@ -17,7 +17,6 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.source import LiveSource
@@ -134,15 +133,3 @@ def test_pose_arrays_hold_whole_bodies() -> None:
     assert not from_pose_array(pose_array(0), COCO17, "y").bodies
     with pytest.raises(ValueError, match="multiple of the 17 joints of coco17, got 20"):
         from_pose_array(pose_array(20), COCO17, "y")
-
-
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        ({"input__ros2__type": "Image"}, "expected MarkerArray or PoseArray, got 'Image'"),
-        ({"input__ros2__up": "x"}, "expected z, y or -y"),
-    ],
-)
-def test_settings_that_cannot_be(make_launch: Callable[..., Launch], setting: dict[str, str], expected: str) -> None:
-    with pytest.raises(LaunchError, match=expected):
-        make_launch(**setting)

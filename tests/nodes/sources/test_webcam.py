@@ -8,7 +8,6 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace as Made
-from typing import Any
 
 import cv2
 import numpy as np
@@ -195,12 +194,6 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         camera.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
-
-
-@pytest.mark.parametrize("wrong", [{"bodies": 0}, {"camera": -1}, {"field_of_view": 60.0}])
-def test_values_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=rf"\[input\.webcam\] {next(iter(wrong))}: expected"):
-        WebcamSettings(**wrong)
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
