@@ -93,7 +93,8 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
         if isinstance(value, bool) != isinstance(default, bool) or not isinstance(
             value, (int, float) if wanted is float else wanted
         ):
-            raise ValueError(f"{name}: expected {wanted.__name__} such as {default!r}, got {value!r}")
+            kind = "true or false" if isinstance(default, bool) else f"{wanted.__name__} such as {default!r}"
+            raise ValueError(f"{name}: expected {kind}, got {value!r}")
         if wanted is float and not math.isfinite(value):
             raise ValueError(f"{name}: expected a finite number such as {default!r}, got {value!r}")
         if isinstance(value, (list, dict)) and (kind := _kind_of_items(cls, key)) is not None:

@@ -12,7 +12,7 @@ from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, unfinished
 from steadypose.nodes.driving import stream
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import AVATAR_NAMES
 
@@ -49,6 +49,7 @@ def export(
         body: id of the body. Default: the one that is visible longest.
         force: replace OUT if it exists.
     """
+    source = located(str(source), Path(), STREAMS)
     check_file(source, out, FORMATS, replace=force)
     if names != "smpl22" and out.suffix not in NAMED:
         raise LaunchError(f"--names {names}: expected OUT to end in {' or '.join(NAMED)}, got {out.suffix}")

@@ -19,7 +19,7 @@ from steadypose.nodes.commands.output import In, Out, check_poses_file, console,
 from steadypose.nodes.driving import clean_joints
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.offline import fit_source, load_transitions, with_bones
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sinks.plot.figure import draw_misfit, save
 from steadypose.nodes.sources.key_points import has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays
@@ -62,6 +62,7 @@ def fit(
             OUT.smpl.1.npz that of the second, and so on.
         force: replace OUT if it is a recording, an .npz or a .csv.
     """
+    source = located(str(source), Path(), STREAMS)
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording, an .npz or a .csv")
     check_poses_file(source, out, replace=force)

@@ -29,6 +29,7 @@ from steadypose.nodes.commands.output import plural, printable
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings, publishers
+from steadypose.nodes.settings import STREAMS, located
 from steadypose.prior.settings import nearest
 
 PATIENCE_S = 3.0
@@ -62,7 +63,7 @@ def messages_of(
 
 
 def recording_at(target: str) -> Path:
-    path = Path(target)
+    path = located(target, Path(), STREAMS)
     if not path.exists():
         raise InspectError(f"no topic or recording {target!r}{nearest(target, TOPICS)}; topics are {', '.join(TOPICS)}")
     return path

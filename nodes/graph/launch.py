@@ -94,7 +94,11 @@ class Launch(_EveryLaunch):
             for override in overrides:
                 apply_override(table, override)
             _add_plugins(table.get("plugins", {}))
-            whole = build_settings(_layout(table), table, "")
+            layout = _layout(table)
+            for key in table.keys() - {setting.name for setting in fields(layout)}:
+                if places := [f"[{name}] {key}" for name, kind in _typed_sections().items() if key in {*_keys(kind)}]:
+                    raise LaunchError(f"{key} is in no section: expected {' or '.join(places)}")
+            whole = build_settings(layout, table, "")
             sections = {name: getattr(whole, name) for name in table.keys() & _sections().keys()}
             add_layouts(whole.skeletons)
             return cls(whole.nodes, whole.transport, whole.server, whole.skeletons, whole.plugins, sections)
@@ -183,14 +187,14 @@ def find(launch: str | Path) -> Path:
     path = Path(launch).expanduser()
     if path.is_file():
         return path.resolve()
+    own = sorted(file.stem for file in bundled("launch").glob("*.toml"))
     if path.parent == Path() and not path.suffix:
-        own = sorted(file.stem for file in bundled("launch").glob("*.toml"))
         if path.name in own:
             return bundled("launch", f"{path.name}.toml")
         raise LaunchError(
             f"no launch file {path.name!r}{nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
         )
-    raise LaunchError(f"no launch file at {path}")
+    raise LaunchError(f"no launch file at {path}{nearest(path.stem, own) if path.parent == Path() else ''}")
 
 
 def apply_override(table: dict[str, Any], override: str) -> None:
@@ -298,9 +302,13 @@ def in_launch_file(launch: str | Path, overrides: Sequence[str]) -> list[str]:
         if kinds.get(first) == "":  # free-form
             full.append(override)
         else:
-            named = [first] if first in kinds else [name for name in kinds if kinds[name]]
-            full.append(full_key(override, {name: load(kinds[name]) for name in named}))
+            full.append(full_key(override, {first: load(kinds[first])} if first in kinds else _typed_sections()))
     return full
+
+
+def _typed_sections() -> dict[str, type]:
+    """Settings dataclasses of all sections that have one. This imports the libraries of all nodes."""
+    return {name: load(kind) for name, kind in (_SECTIONS_OF_ALL | _sections()).items() if kind}
 
 
 def _keys(kind: type) -> Iterator[str]:

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from steadypose.nodes.driving import NOBODY, OfflineRun, Settings
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.graph.launch import check_settings
+from steadypose.nodes.graph.launch import PIPELINES, check_settings
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.library.poses import Poses
-from steadypose.nodes.settings import LaunchError, launch_errors
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import draw, save
 from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_path
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
@@ -69,22 +69,25 @@ def _callers_level() -> int:
     return level
 
 
-def sections(settings: Settings | None, delay: int) -> Settings:
-    """The sections ``prior`` and ``trajectory``; a delay in ``settings`` takes precedence over ``delay``.
+def sections(settings: Settings | None, delay: int, known: Sequence[str] = ("prior", "trajectory")) -> Settings:
+    """The sections ``known``; a delay in ``settings`` takes precedence over ``delay``.
 
     Raises:
         LaunchError: ``settings`` has another section, or a setting cannot be used.
     """
-    given = dict(settings or {})
-    for section in given.keys() - {"prior", "trajectory"}:
-        hint = nearest(section.partition(".")[0], ("prior", "trajectory"))
-        raise LaunchError(
-            f"settings: expected sections 'prior' and 'trajectory', each with its settings, such as "
-            f"{{'prior': {{'delay': 2}}}}; got {section!r}{hint}"
-        )
-    both = {"prior": {"delay": delay} | dict(given.get("prior", {})), "trajectory": given.get("trajectory", {})}
-    check_settings(both)
-    return both
+    given: Settings = {} if settings is None else settings
+    named = given if isinstance(given, Mapping) else {given: None}
+    for name, part in named.items():
+        if name not in known or not isinstance(part, Mapping):
+            got = f"{name} = {part!r}" if name in known else f"{name!r}{nearest(str(name).partition('.')[0], known)}"
+            raise LaunchError(
+                f"settings: expected sections {' and '.join(map(repr, known))}, each with its settings, such as "
+                f"{{'prior': {{'delay': 2}}}}; got {got}"
+            )
+    found = {name: dict(given.get(name, {})) for name in known}
+    found["prior"] = {"delay": delay} | found["prior"]
+    check_settings(found)
+    return found
 
 
 def skeleton_name(skeleton: SkeletonLike) -> str:
@@ -199,10 +202,8 @@ def clean(
         InputWarning: units, axes or joint order are probably wrong. The texts are also in ``problems``.
     """
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    pipelines = dict(settings or {})
-    with launch_errors():
-        timeline = EventTimeline(build_settings(EventSettings, pipelines.pop("events", {}), "events"))
-    checked = sections(pipelines, delay)
+    checked = sections(settings, delay, PIPELINES)
+    timeline = EventTimeline(build_settings(EventSettings, checked["events"], "events"))
     compile_loops()
     run = OfflineRun(source, checked, timeline)
     arrays = run.arrays()

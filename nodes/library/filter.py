@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,8 @@ class Filter:
         if self._skeleton not in SKELETONS:
             hint = skeleton_hint(self._skeleton, ())
             raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
+        if not isinstance(sensor_pose, Pose | None):
+            raise FilterError(f"sensor_pose: expected steadypose.Pose(position, orientation), got {sensor_pose!r}")
         self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
         given = sections(settings, delay)
         compile_loops()
@@ -201,10 +204,11 @@ class Filter:
             if sure.size != positions.shape[0] * wanted[0]:
                 raise FilterError(f"confidence: expected {positions.shape[:-1]}, got {sure.shape}")
             sure = sure.reshape(positions.shape[:-1])
-        numbers = list(range(len(positions))) if ids is None else [int(id) for id in ids]
-        if len(numbers) != len(positions) or len(set(numbers)) != len(numbers):
-            raise FilterError(f"ids: expected {len(positions)} different numbers, one a body, got {list(ids or ())}")
-        bodies = [RawBody(*parts) for parts in zip(numbers, positions, sure, strict=True)]
+        numbers = list(range(len(positions))) if ids is None else list(ids)
+        different = all(isinstance(id, Integral) for id in numbers) and len(set(numbers)) == len(numbers)
+        if len(numbers) != len(positions) or not different:
+            raise FilterError(f"ids: expected {len(positions)} different integers, one a body, got {list(ids or ())}")
+        bodies = [RawBody(int(id), *parts) for id, *parts in zip(numbers, positions, sure, strict=True)]
         return [body for body in bodies if not (several and np.isnan(body.positions).all())], several
 
 
@@ -213,9 +217,11 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
     if (t is None) == (stamp_ns is None):
         raise FilterError("expected the time of capture: t in seconds, or stamp_ns; cleaner(joints, time.time())")
     if stamp_ns is not None:
+        if not isinstance(stamp_ns, Real) or stamp_ns != round(stamp_ns):
+            raise FilterError(f"stamp_ns: expected whole nanoseconds, got {stamp_ns!r}; seconds are t")
         return int(stamp_ns)
-    if not math.isfinite(t) or t < 0:  # type: ignore[operator]  (one of the two is given)
+    if not isinstance(t, Real) or not math.isfinite(t) or t < 0:
         raise FilterError(f"t: expected seconds of 0 or more, got {t!r}")
-    if t >= 2**31:  # type: ignore[operator]
+    if t >= 2**31:
         raise FilterError(f"t: expected seconds, got {t!r}; say stamp_ns= of nanoseconds, divide milliseconds by 1000")
-    return round(t * 1e9)  # type: ignore[operator]
+    return round(t * 1e9)

@@ -209,7 +209,8 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, N
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file if names is None or name in names}
     except Exception as error:  # for damaged files, zipfile, zlib and numpy raise a dozen kinds of exceptions
-        raise NpzError(f"{path}: cannot be read as .npz: {error}") from error
+        hint = "; save arrays of numbers, not lists of different lengths" * ("allow_pickle" in str(error))
+        raise NpzError(f"{path}: cannot be read as .npz: {error}{hint}") from error
 
 
 def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:

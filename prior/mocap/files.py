@@ -93,7 +93,7 @@ def read_motion(name: str, content: bytes, description: Description = UNDESCRIBE
     if suffix not in _READERS:
         raise MotionError(f"{name}: expected one of {', '.join(SUFFIXES)}")
     try:
-        fps, skeleton, positions, up = _READERS[suffix](content, description)
+        fps, skeleton, positions, up = documented(_READERS[suffix])(content, description)
     except (MotionError, RigError) as error:
         raise MotionError(f"{name}: {error}") from error
     body = to_canonical(skeleton, positions)[0]

@@ -122,6 +122,30 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.Filter()(np.concatenate([j, j, j]), 0.0),
         r"got 150; frames go one by one, and a whole recording into steadypose\.clean",
     ),
+    "seconds as text": (
+        lambda j: steadypose.Filter()(j[0], "0.1"),  # type: ignore[arg-type]
+        "t: expected seconds of 0 or more, got '0.1'",
+    ),
+    "seconds as nanoseconds": (
+        lambda j: steadypose.Filter()(j[0], stamp_ns=1.7e9 + 0.3),  # type: ignore[arg-type]
+        "stamp_ns: expected whole nanoseconds, got 1700000000.3; seconds are t",
+    ),
+    "names for ids": (
+        lambda j: steadypose.Filter()(j[:1], 0.1, ids=["anna"]),  # type: ignore[list-item]
+        "ids: expected 1 different integers, one a body, got .'anna'.",
+    ),
+    "a place for a pose": (
+        lambda j: steadypose.Filter(sensor_pose=(0.0, 0.0, 1.4)),  # type: ignore[arg-type]
+        r"sensor_pose: expected steadypose\.Pose",
+    ),
+    "a section that is a number": (
+        lambda j: steadypose.clean(j, fps=30, settings={"prior": 2}),  # type: ignore[dict-item]
+        r"each with its settings, such as .*; got prior = 2",
+    ),
+    "an event's threshold that there is not": (
+        lambda j: steadypose.clean(j, fps=30, settings={"events": {"neer": 2.0}}),
+        r"\[events\] has no setting 'neer': did you mean 'near'",
+    ),
     "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
 }
 
@@ -156,6 +180,17 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         {"in.csv": "0.0, 1.0, 2.0, 3.0\n"},
         "rename another program's columns to stamp, JOINT_x",
     ),
+    "a launch file with a mistyped key": (
+        ["run", "mine.toml"],
+        {"mine.toml": "[input]\nrecording = 'walk_turn'\n[prior.gate]\njmup = 2"},
+        "[prior.gate] has no setting 'jmup': did you mean 'jump'?",
+    ),
+    "weights that there are not": (
+        ["run", "replay", "--set", "smooth.weights=mine"],
+        {},
+        "no weights 'mine' for mixture: expected mixture-mine.safetensors; there are default",
+    ),
+    "a broken .npy": (["clean", "in.npy", "out.npz"], {"in.npy": "x"}, "in.npy: cannot be read"),
     "a picture": (["clean", "in.png", "out.npz"], {"in.png": "x"}, "or a video, got '.png'"),
     "a text to draw": (
         ["plot", "in.txt"],

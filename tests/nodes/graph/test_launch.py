@@ -86,6 +86,8 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input.oak]\nfps = -1", "fps: expected 0 "),
         ("[input]\nsource = 'oka'", r"source: expected .*oak.*, got 'oka', did you mean 'oak'"),
         ("[input", "is not TOML"),
+        ("delay = 2", r"delay is in no section: expected \[prior\] delay"),
+        ("[input]\nloop = 'yes'", "loop: expected true or false, got 'yes'"),
         ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya': did you mean 'delay'"),
         ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup': did you mean 'jump'"),
         ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
@@ -100,6 +102,8 @@ def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expec
 def test_a_missing_file_names_those_there_are() -> None:
     with pytest.raises(LaunchError, match="did you mean 'replay'"):
         find("repaly")
+    with pytest.raises(LaunchError, match=r"no launch file at web.tml, did you mean 'web'"):
+        find("web.tml")
     with pytest.raises(LaunchError, match="no launch file at"):
         find("/nowhere/x.toml")
 
