@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import count, cycle
 
 import numpy as np
 from conftest import repeated, running, until
@@ -52,26 +54,17 @@ def test_events_are_off_unless_a_launch_file_has_them(make_launch: Callable[...,
 
 def test_the_node_publishes_what_the_trajectory_node_makes_known(make_launch: Callable[..., Launch]) -> None:
     launch = make_launch(nodes='["trajectory", "events"]', transport__lossless="false")
-    node, found = EventsNode(launch), []
-    stream = worlds(1.0)
-    at = iter(range(10**9))
+    stream, stamps = cycle(worlds(1.0)), count(10**9, 33_333_333)
     with (
         Publisher(launch.transport.endpoint("trajectory")) as publisher,
-        running(node),
+        running(EventsNode(launch)),
         Subscriber([launch.transport.endpoint("events")], [POSE_EVENTS]) as subscriber,
+        repeated(lambda: publisher.publish(POSE_WORLD, replace(next(stream), stamp_ns=next(stamps)))),
     ):
 
-        def go_on() -> None:
-            index = next(at)
-            world = stream[index % len(stream)]
-            world.stamp_ns = 10**9 + index * 33_333_333
-            publisher.publish(POSE_WORLD, world)
-
-        def entered() -> bool:
+        def stands() -> bool:
             received = subscriber.receive(0.01)
-            if received and isinstance(received[1], PoseEvents):
-                found.extend(received[1].events)
-            return any(event.kind == EventKind.STANDS for event in found)
+            events = received[1].events if received and isinstance(received[1], PoseEvents) else []
+            return any(event.kind == EventKind.STANDS for event in events)
 
-        with repeated(go_on):
-            until(entered)
+        until(stands)

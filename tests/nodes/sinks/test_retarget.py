@@ -136,16 +136,8 @@ def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:
     ("old", "new", "said"),
     [
         ("</robot>", "", "is no URDF"),
-        (
-            '<limit lower="-0.09" upper="2.88"',
-            '<limit lower="2.88" upper="-0.09"',
-            "left_knee_joint: expected lower < upper",
-        ),
-        (
-            'name="left_knee_joint" type="revolute"',
-            'name="left_knee_joint" type="continuous"',
-            "expected revolute or prismatic",
-        ),
+        ('lower="-0.09" upper="2.88"', 'lower="2.88" upper="-0.09"', "left_knee_joint: expected lower < upper"),
+        ('"left_knee_joint" type="revolute"', '"left_knee_joint" type="continuous"', "expected revolute or prismatic"),
         ("left_knee_link", "left_middle_link", "no link is named for left_knee: name one with links"),
         ('<child link="waist_yaw_link"/>', '<child link="waist_roll_link"/>', "expected one link without a parent"),
     ],

@@ -19,7 +19,7 @@ from steadypose.msgs.types import Message, PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import NpzError, NpzSource
-from steadypose.nodes.sources.pose_input import LEAP_NS, PoseInputNode
+from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource, open_recording
 from steadypose.nodes.sources.registry import InputSettings
 
@@ -113,29 +113,20 @@ def test_the_end_is_marked_once(launch: Launch, clock: VirtualClock) -> None:
     assert sent[-1][1].bodies == []
 
 
-def test_a_pause_of_ten_seconds_is_a_pause(launch: Launch, clock: VirtualClock) -> None:
-    sent = play(launch, clock, Frames([START_NS, START_NS + 10 * SECOND_NS]))
-    assert waits(sent)[0] == pytest.approx(10.0)
-
-
-def test_a_clock_that_was_set_is_not_waited_for(launch: Launch, clock: VirtualClock) -> None:
-    hour = 3600 * SECOND_NS
-    stamps = [START_NS, START_NS + hour, START_NS + hour + SECOND_NS, START_NS, START_NS + SECOND_NS]
-    sent = play(launch, clock, Frames(stamps))
-    assert hour > LEAP_NS
-    assert waits(sent)[:4] == pytest.approx([0.0, 1.0, 0.0, 1.0])
-
-
-def test_one_stamp_that_is_ahead_is_not_waited_for(launch: Launch, clock: VirtualClock) -> None:
-    stamps = [START_NS + i * SECOND_NS for i in (0, 1, 7, 7, 3, 4, 14, 5, 6)]
+@pytest.mark.parametrize(
+    ("seconds", "waited"),
+    [
+        pytest.param([0, 10], [10], id="a pause of ten seconds is a pause"),
+        pytest.param([1, 1, 0], [0, 0], id="stamps that repeat or step back come at once"),
+        pytest.param([0, 3600, 3601, 0, 1], [0, 1, 0, 1], id="a clock that was set is not waited for"),
+        pytest.param([0, 1, 7, 7, 3, 4, 14, 5, 6], [1, 2, 0, 0, 1, 1, 0, 1], id="nor is one stamp that is ahead"),
+    ],
+)
+def test_what_is_waited_for(launch: Launch, clock: VirtualClock, seconds: list[int], waited: list[int]) -> None:
+    stamps = [START_NS + at * SECOND_NS for at in seconds]
     sent = play(launch, clock, Frames(stamps))
     assert [m.stamp_ns for _, m in sent[:-1]] == stamps, "stamps are as captured"
-    assert waits(sent)[:8] == pytest.approx([1.0, 2.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0])
-
-
-def test_stamps_that_repeat_or_step_back_come_at_once(launch: Launch, clock: VirtualClock) -> None:
-    sent = play(launch, clock, Frames([START_NS + SECOND_NS, START_NS + SECOND_NS, START_NS]))
-    assert waits(sent)[:2] == [0.0, 0.0]
+    assert waits(sent)[:-1] == pytest.approx(waited)
 
 
 def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) -> None:
@@ -145,15 +136,6 @@ def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) 
     assert seconds == [0, 1, 2, 3, 4, 5, 6]
     assert not any(m.end_of_stream for _, m in sent)
     assert waits(sent) == pytest.approx([1.0] * 6)
-
-
-def test_the_nodes_are_told_which_stamp_is_played_when(launch: Launch, clock: VirtualClock) -> None:
-    node = PoseInputNode(launch, clock, Frames([START_NS, START_NS + SECOND_NS]))
-    node._publisher = Sent(clock)  # type: ignore[assignment]
-    start_ns = clock.time_ns
-    node.work()
-    assert node.timeline is not None
-    assert node.timeline.wall(START_NS + SECOND_NS) == start_ns + SECOND_NS
 
 
 def test_a_recording_gives_raw_and_truth_and_not_what_was_made_of_them(tmp_path: Path) -> None:

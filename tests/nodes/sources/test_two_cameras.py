@@ -1,4 +1,4 @@
-"""Two cameras to one stream of bodies in the world, over real sockets."""
+"""Two cameras to one source of bodies in the world, over real sockets."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, listeners, running, until, walk
+from conftest import VirtualClock, until, walk
 from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.transport import Publisher, Subscriber
-from steadypose.msgs.types import Pose, PoseRaw, PoseWorld, RawBody
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.graph.prior_node import PriorNode
-from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
@@ -47,51 +45,22 @@ def filmed(camera: str, hidden: range) -> list[PoseRaw]:
     return messages
 
 
-def test_two_cameras_become_one_world(make_launch: Callable[..., Launch], folder: Path, clock: VirtualClock) -> None:
-    addresses = {name: f"ipc://{folder}/{name}" for name in PLACES}
-    launch = make_launch(
-        input__source="merge",
-        input__merge__cameras=str(list(addresses.values())),
-        prior__identify__enabled="true",
-        transport__lossless="false",
-        transport__queue=100,
-        transport__lifespan_s=1000.0,
-    )
-    views = {"left": filmed("left", range(18, 20)), "right": filmed("right", range(4, 6))}
-    nodes = PoseInputNode(launch, clock), PriorNode(launch, clock), TrajectoryNode(launch, clock)
-    merged: list[PoseRaw] = []
-    worlds: list[PoseWorld] = []
-    with (
-        Publisher(addresses["left"]) as left,
-        Publisher(addresses["right"]) as right,
-        running(*nodes),
-        Subscriber(
-            [launch.transport.endpoint(name) for name in ("pose_input", "trajectory")],
-            [POSE_RAW, POSE_WORLD],
-            name="test",
-        ) as subscriber,
-    ):
+def test_two_cameras_become_one(folder: Path, clock: VirtualClock) -> None:
+    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
+    source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
+    frames, merged = source.frames(), []
+    with Publisher(addresses[0]) as left, Publisher(addresses[1]) as right:
+        assert next(frames) is None
         for publisher in (left, right):
             assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
-        until(lambda: clock.sleep(33_333_333) or {"prior", "test"} <= listeners(nodes[0]))
-        until(lambda: clock.sleep(33_333_333) or {"trajectory"} <= listeners(nodes[1]))
-        until(lambda: clock.sleep(33_333_333) or {"test"} <= listeners(nodes[2]))
-        for k in range(FRAMES):
-            clock.time_ns += 33_333_333
-            left.publish(POSE_RAW, views["left"][k])
-            right.publish(POSE_RAW, views["right"][k])
-            until(lambda k=k: nodes[0]._source._received.total() == 2 * (k + 1))  # type: ignore[union-attr]
-            for before, after, topic in zip(nodes, nodes[1:], (POSE_RAW, POSE_CLEAN), strict=False):
-                # who falls behind, as the clock does not wait, takes the newest alone
-                until(lambda a=after, b=before, t=topic: a.health.received[t] >= b.health.published[t])
-
-        def answered() -> bool:
-            while received := subscriber.receive(0):
-                kind = received[1]
-                (merged if isinstance(kind, PoseRaw) else worlds).append(kind)  # type: ignore[arg-type]
-            return len(merged) >= FRAMES - 3 and len(worlds) >= FRAMES - 10
-
-        until(answered)
+        for views in zip(filmed("left", range(18, 20)), filmed("right", range(4, 6)), strict=True):
+            for publisher, view in zip((left, right), views, strict=True):
+                publisher.publish(POSE_RAW, view)
+                count = source._received.total()
+                while source._received.total() == count:
+                    merged += [frame] if (frame := next(frames)) else []
+    frames.close()
+    assert len(merged) >= FRAMES - 3
     assert all(m.source == "merged" and m.frame_id == "world" and m.calibrated for m in merged)
     truth = {m.stamp_ns: [b.positions for b in m.bodies] for m in walk(FRAMES, bodies=2)}
     for m in merged[2:]:  # who comes first is not kept waiting for cameras nobody has heard of
@@ -100,9 +69,7 @@ def test_two_cameras_become_one_world(make_launch: Callable[..., Launch], folder
         for positions in nearest:
             away = min(float(np.abs(body.positions - positions).max()) for body in m.bodies)
             assert away < 0.15, "complete, though neither camera saw all, and where the walker is"
-    ids = [sorted(body.id for body in world.bodies) for world in worlds if world.bodies]
-    assert ids[-1] == [1, 2]
-    assert nodes[0].status()["camera"] == "2 of 2 cameras heard"
+    assert source.status()["camera"] == "2 of 2 cameras heard"
 
 
 def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
