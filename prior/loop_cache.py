@@ -30,7 +30,7 @@ from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 150
+LOOPS = 147
 """Number of entries that the nodes need with the default settings."""
 COMPLETE = "complete"
 """Name of a file beside the entries: the digest of the sources for which all entries exist."""
@@ -218,11 +218,7 @@ def warn_uncached(say: Callable[[str], None]) -> None:
 
 @cache
 def digest(loop: Any) -> str:
-    """Return a digest of everything that a loop is compiled from: its code, and the constants and loops that it names.
-
-    Args:
-        loop: a numba dispatcher.
-    """
+    """Return a digest of what a dispatcher is compiled from: its code, and the constants and loops that it names."""
     function, found = loop.py_func, hashlib.sha256()
     for part in _parts(function, loop):
         found.update(part.encode() + b"\0")

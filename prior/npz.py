@@ -58,8 +58,6 @@ def check_arrays(file: IO[bytes] | Path) -> None:
                 f"{packed} bytes that become {total}: expected at most {MAX_RATIO} times as many; if it is as it "
                 "should be, save it without compression (numpy.savez)"
             )
-    if not isinstance(file, Path):
-        file.seek(0)
 
 
 @contextmanager

@@ -89,11 +89,9 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
                 raise ValueError(f"{name}: expected a section, got {value!r}")
             values[key] = build_settings(type(default), value, f"{path}.{key}".lstrip("."))
             continue
-        wanted = float if isinstance(default, float) else type(default)
-        if isinstance(value, bool) != isinstance(default, bool) or not isinstance(
-            value, (int, float) if wanted is float else wanted
-        ):
-            kind = "true or false" if isinstance(default, bool) else f"{wanted.__name__} such as {default!r}"
+        wanted = type(default)
+        if not _is_of(wanted, value):
+            kind = "true or false" if wanted is bool else f"{wanted.__name__} such as {default!r}"
             raise ValueError(f"{name}: expected {kind}, got {value!r}")
         if wanted is float and not math.isfinite(value):
             raise ValueError(f"{name}: expected a finite number such as {default!r}, got {value!r}")
@@ -130,10 +128,12 @@ def _kind_of_items(cls: type, key: str) -> type | None:
     return kinds[-1] if kinds and kinds[-1] in (int, float) else None
 
 
+def _is_of(kind: type, value: object) -> bool:
+    """Whether a value from a launch file is of a kind. An integer is also a float; True and False are no numbers."""
+    return isinstance(value, bool) == (kind is bool) and isinstance(value, (int, float) if kind is float else kind)
+
+
 def _check_items(name: str, value: list[Any] | dict[str, Any], kind: type) -> None:
     for item in value.values() if isinstance(value, dict) else value:
-        fits = isinstance(item, (int, float) if kind is float else kind) and (
-            kind is bool or not isinstance(item, bool)
-        )
-        if not fits or (isinstance(item, float) and not math.isfinite(item)):
+        if not _is_of(kind, item) or (isinstance(item, float) and not math.isfinite(item)):
             raise ValueError(f"{name}: expected each to be a {kind.__name__}, got {item!r}")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import (
@@ -82,8 +82,8 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
         lengths = np.concatenate([np.linalg.norm(positions[:, a] - positions[:, b], axis=-1) for a, b in ends])
         lengths = lengths[np.isfinite(lengths)]
         if len(lengths):
-            median = _median(lengths)
-            deviation = 1.4826 * _median(np.abs(lengths - median))
+            median = medians(lengths)
+            deviation = 1.4826 * medians(np.abs(lengths - median))
             log_ratio[k] = np.log(max(median, 0.1 * generic) / generic)
             # the part of the deviation that noise does not explain varies as slowly as the bias
             slow = max(deviation**2 - noise**2, bias**2)
@@ -132,12 +132,6 @@ def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
     return list(pairs.values())
 
 
-def _median(values: Floats) -> Floats:
-    """Median along the first axis; for few values ten times faster than numpy's."""
-    ordered = np.sort(values, axis=0)
-    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
-
-
 def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats, weight: float) -> Floats:
     """Return offsets (22, 3) with hips, neck and collars moved by ``weight`` towards the samples (T, 22, 3)."""
     placed = offsets.copy()
@@ -152,7 +146,7 @@ def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats,
                 both.append(vectors[finite_joints(vectors)] * [1.0, side, 1.0])
             vectors = np.concatenate(both)
             if len(vectors):
-                moved = offsets[joint] + weight * (_median(vectors) - offsets[joint])
+                moved = offsets[joint] + weight * (medians(vectors) - offsets[joint])
                 if MIRROR[joint] == joint:
                     moved[1] = 0.0
                 placed[joint], placed[MIRROR[joint]] = moved, moved * [1.0, -1.0, 1.0]

@@ -26,20 +26,16 @@ CAPSULES: tuple[tuple[str, str, float], ...] = (
     ("pelvis", "spine3", 0.125),
     ("left_hip", "right_hip", 0.115),
     ("spine3", "neck", 0.11),
-    ("left_collar", "left_shoulder", 0.065),
-    ("right_collar", "right_shoulder", 0.065),
     ("neck", "head", 0.09),
-    ("left_hip", "left_knee", 0.075),
-    ("right_hip", "right_knee", 0.075),
-    ("left_knee", "left_ankle", 0.05),
-    ("right_knee", "right_ankle", 0.05),
-    ("left_ankle", "left_foot", 0.04),
-    ("right_ankle", "right_foot", 0.04),
-    ("left_shoulder", "left_elbow", 0.045),
-    ("right_shoulder", "right_elbow", 0.045),
-    ("left_elbow", "left_wrist", 0.04),
-    ("right_elbow", "right_wrist", 0.04),
-)
+    *(
+        (f"{side}_{start}", f"{side}_{end}", radius)
+        for start, end, radius in (
+            ("collar", "shoulder", 0.065), ("shoulder", "elbow", 0.045), ("elbow", "wrist", 0.04),
+            ("hip", "knee", 0.075), ("knee", "ankle", 0.05), ("ankle", "foot", 0.04),
+        )
+        for side in ("left", "right")
+    ),
+)  # fmt: skip
 """Capsules of the body's volume: from joint, to joint, radius for a stature of 1.72 m, metres."""
 
 _ARM, _LEG = ("elbow", "wrist"), ("knee", "ankle", "foot")

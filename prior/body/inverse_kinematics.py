@@ -118,7 +118,8 @@ def solve_pose(
     """Return the rotations of `solve_rotations`, and the positions (..., 22, 3) that they give with these bones."""
     shape = np.shape(positions)
     p, bones = _frames(positions, shape), _frames(offsets, shape)
-    local, placed = _initial(fallback, p), np.empty_like(p)
+    local, placed = np.empty((*p.shape, 3)), np.empty_like(p)
+    local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
     if root is not None:
         local[:, 0] = np.reshape(root, (-1, 3, 3))
     _solve(p, np.asarray(finite_joints(p)), bones, local, placed, root is not None)
@@ -166,13 +167,6 @@ def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating])
     placed = np.empty_like(bones)
     _place(np.array(rotations, dtype=np.float64, order="C").reshape(*bones.shape, 3), bones, placed)
     return placed.reshape(shape)
-
-
-def _initial(fallback: NDArray[np.floating] | None, positions: Floats) -> Floats:
-    """(B, 22, 3, 3) initial local rotations."""
-    local = np.empty((*positions.shape, 3))
-    local[...] = np.eye(3) if fallback is None else np.reshape(fallback, local.shape)
-    return local
 
 
 def _frames(values: NDArray[np.floating], shape: tuple[int, ...]) -> Floats:

@@ -227,8 +227,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
     """Recognise the skeleton of named points in TRC and C3D files by their names, as points have no tree.
 
     A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are the same joint. Pelvis,
-        neck
-    and head may be midpoints of hips, shoulders and ears. A joint without points stays unobserved.
+    neck and head may be midpoints of hips, shoulders and ears. A joint without points stays unobserved.
 
     Raises:
         RigError: hips or shoulders are missing.

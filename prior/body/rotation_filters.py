@@ -28,6 +28,7 @@ from steadypose.prior.body.vectors import (
     rotated,
     rotated_back,
     write_product,
+    write_relative,
     write_rotation,
     write_swing,
 )
@@ -73,7 +74,8 @@ def unknown_twist(slots: int) -> Floats:
     return state
 
 
-def follow_twist(orientations: Floats, offsets: Floats, sigma: Floats, state: Floats) -> None:
+@njit(cache=True)
+def follow_twist(orientations, offsets, sigma, state):
     """Filter the twist of limbs for one frame, in place. Directions of bones, and so joint positions, do not change.
 
     Args:
@@ -82,13 +84,8 @@ def follow_twist(orientations: Floats, offsets: Floats, sigma: Floats, state: Fl
         sigma: (B, 22) metres along an axis, standard deviations of the joints used for the solution.
         state: (B, 4, 2) from `unknown_twist`, updated.
     """
-    _follow(orientations, offsets, sigma, state)
-
-
-@njit(cache=True)
-def _follow(orientations, offsets, sigma, state):
     turn, twist, swing = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    before = np.empty((3, 3, 3))
+    of_end, of_last = np.empty((3, 3)), np.empty((3, 3))
     for row in range(len(orientations)):
         world, bones = orientations[row], offsets[row]
         for limb in range(LIMBS):
@@ -114,35 +111,20 @@ def _follow(orientations, offsets, sigma, state):
             angle += gain * off
             angle = (angle + math.pi) % (2.0 * math.pi) - math.pi
             state[row, limb, 0], state[row, limb, 1] = angle, (1.0 - gain) * variance
-            for i in range(3):
-                for j in range(3):
-                    before[0, i, j], before[1, i, j] = world[ball, i, j], world[middle, i, j]
-                    before[2, i, j] = world[end, i, j]
+            last = _CHAIN_END[limb]
+            write_relative(world[middle], world[end], of_end)
+            toe = rotated(world[end], point(bones, last))  # unused without a joint beyond the end
+            write_relative(world[end], world[last], of_last)
             write_rotation(upper, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
             write_product(twist, turn, world[ball])
             # knee and elbow swing from the upper bone's new orientation, and carry the joints below
             write_swing(point(bones, end), rotated_back(world[ball], lower), swing)
             write_product(world[ball], swing, world[middle])
-            last = _CHAIN_END[limb]
-            for i in range(3):
-                for j in range(3):
-                    turn[i, j] = 0.0
-                    for k in range(3):
-                        turn[i, j] += before[1, k, i] * before[2, k, j]
             if last >= 0:
-                toe = rotated(before[2], point(bones, last))
-                write_swing(point(bones, last), rotated_back(world[middle], toe), turn)
-            write_product(world[middle], turn, world[end])
+                write_swing(point(bones, last), rotated_back(world[middle], toe), of_end)
+            write_product(world[middle], of_end, world[end])
             if last >= 0:
-                for i in range(3):
-                    for j in range(3):
-                        before[0, i, j] = 0.0
-                        for k in range(3):
-                            before[0, i, j] += before[2, k, i] * world[last, k, j]
-                write_product(world[end], before[0], swing)
-                for i in range(3):
-                    for j in range(3):
-                        world[last, i, j] = swing[i, j]
+                write_product(world[end], of_last, world[last])
 
 
 def unknown_turns(bodies: int) -> Floats:

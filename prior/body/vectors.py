@@ -32,6 +32,13 @@ def dot(a, b):
 
 
 @njit(cache=True)
+def apart(points, a, b):
+    """Distance between two joints of ``points`` (J, 3); NaN if either is unobserved."""
+    between = difference(point(points, a), point(points, b))
+    return math.sqrt(dot(between, between))
+
+
+@njit(cache=True)
 def cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
@@ -68,6 +75,14 @@ def write_product(a, b, out):
     for i in range(3):
         for j in range(3):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@njit(cache=True)
+def write_relative(a, b, out):
+    """Write ``a.T @ b``, both (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
 
 
 @njit(cache=True)

@@ -280,13 +280,10 @@ def _trunk_depth(pixels: Floats, view: _View) -> float:
     return float(samples[(start + last[start]) // 2])
 
 
-def _surface(samples: Floats, low: float, high: float, share: float = _MIN_FILL) -> float:
-    """Depth of the nearest surface from ``low`` to ``high`` that fills a share of samples (S,), or NaN."""
-    return _nearest_surface(samples.ravel(), low, high, max(share * samples.size, 3.0))
-
-
-@njit("f8(f8[::1], f8, f8, f8)", cache=True)
-def _nearest_surface(samples: Floats, low: float, high: float, least: float) -> float:
+@njit("f8(f8[::1], f8, f8)", cache=True)
+def _surface(samples: Floats, low: float, high: float) -> float:
+    """Depth of the nearest surface from ``low`` to ``high`` that fills enough of the samples (S,), or NaN."""
+    least = max(_MIN_FILL * len(samples), 3.0)
     depths = np.sort(samples[(samples >= low) & (samples <= high)])
     if len(depths) < least:
         return np.nan

@@ -18,9 +18,8 @@ from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.timing.rate import FPS
+from steadypose.prior.timing.resample import PERIOD_NS
 
-PERIOD_NS = round(1e9 / FPS)
 SOURCE, FRAME_ID = "merged", "world"
 MATCH_RADIUS_M = 0.4
 """Largest distance between two cameras' observations of one body, median over the joints, metres."""
@@ -93,7 +92,8 @@ class Merge:
         self._last[raw.source] = frame
         if before and frame.stamp_ns - before.stamp_ns > MAX_GAP_NS:
             before = None  # too long ago to interpolate bodies in between
-        for tick in _ticks(before.stamp_ns if before else frame.stamp_ns - PERIOD_NS, frame.stamp_ns):
+        after_ns = before.stamp_ns if before else frame.stamp_ns - PERIOD_NS
+        for tick in range((after_ns // PERIOD_NS + 1) * PERIOD_NS, frame.stamp_ns + 1, PERIOD_NS):
             if tick > self._given_ns:
                 self._waiting.setdefault(tick, []).append(_interpolated(before, frame, tick))
         return self._complete()
@@ -202,11 +202,6 @@ def merge_joints(bodies: list[CameraBody]) -> tuple[Floats, Floats]:
     merged = np.linalg.solve(total, pulled)[..., 0]
     merged = np.where(any_used[:, None], merged, np.nan)
     return merged, 1.0 - np.prod(np.where(used, 1.0 - confidence, 1.0), axis=0)
-
-
-def _ticks(after_ns: int, until_ns: int) -> range:
-    """Return the grid times after one stamp, up to another."""
-    return range((after_ns // PERIOD_NS + 1) * PERIOD_NS, until_ns + 1, PERIOD_NS)
 
 
 def _interpolated(before: CameraFrame | None, after: CameraFrame, tick: int) -> CameraFrame:

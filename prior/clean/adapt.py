@@ -43,10 +43,8 @@ class BodyJoints(NamedTuple):
 
 def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:
     """Stack N bodies into arrays (N, 22, 3) and (N, 22)."""
-    return BodyJoints(
-        np.array([body.positions for body in bodies]).reshape(-1, 22, 3),
-        np.array([body.confidence for body in bodies]).reshape(-1, 22),
-    )
+    positions, confidence = zip(*bodies, strict=True) if bodies else ((), ())
+    return BodyJoints(np.reshape(positions, (-1, 22, 3)), np.reshape(confidence, (-1, 22)))
 
 
 def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:

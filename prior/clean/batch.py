@@ -45,30 +45,18 @@ grew."""
 
 @dataclass
 class _Stream:
-    """State of one stream. Times are on the server's clock.
+    """State of one stream. Times are on the server's clock."""
 
-    Attributes:
-        resampler: resamples to the shared grid; its slots are those of the batch.
-        identify: assigns ids to its bodies; None if the source does.
-        offset_ns: offset from its clock to the server's.
-        last: its newest message.
-        sensor_pose: outlier rejection of its sensor's pose.
-        time_ns: capture time of the newest message.
-        heard_ns: arrival time of the newest message.
-        first_ns, newest_ns: first and newest grid time with joints of this stream; negative before the first.
-        late: number of its frames in a row that came too late.
-    """
-
-    resampler: Resampler
-    identify: Identify | None
-    offset_ns: float
-    last: PoseRaw
+    resampler: Resampler  # to the shared grid; its slots are those of the batch
+    identify: Identify | None  # None if the source assigns ids to its bodies
+    offset_ns: float  # from its clock to the server's
+    last: PoseRaw  # its newest message
     sensor_pose: SensorPoseGate
-    time_ns: int = -1
-    heard_ns: int = -1
-    first_ns: int = -1
+    time_ns: int = -1  # capture time of the newest message
+    heard_ns: int = -1  # arrival time of the newest message
+    first_ns: int = -1  # first and newest grid time with joints of this stream; negative before the first
     newest_ns: int = -1
-    late: int = 0
+    late: int = 0  # number of its frames in a row that came too late
 
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):

@@ -22,6 +22,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.bone_lengths import estimate_bones
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
+from steadypose.prior.body.vectors import apart
 from steadypose.prior.clean.frame import Person
 from steadypose.prior.clean.settings import PersonSettings
 from steadypose.prior.compiled import median, njit
@@ -198,7 +199,7 @@ def _estimate(positions, sigma, offsets, expected, moments, bias, length_varianc
         for k in range(len(RIGID)):
             a, b = RIGID[k]
             left = sigma[s, a] ** 2 + sigma[s, b] ** 2
-            length = _apart(positions[s], a, b)
+            length = apart(positions[s], a, b)
             most = max(most, frames[k])
             if not (left < 2 * MAX_SIGMA**2 and math.isfinite(length)):
                 continue
@@ -221,14 +222,6 @@ def _estimate(positions, sigma, offsets, expected, moments, bias, length_varianc
             if frames[k] <= MIN_FRAMES:
                 length_variance[s, k] = UNKNOWN_VARIANCE
                 continue
-            own = _apart(rest, RIGID[k, 0], RIGID[k, 1])
-            apart = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / CORRELATION_FRAMES, 1.0)
-            length_variance[s, k] = max(apart, 0.0) + max(variance[k] - noise[k] - 2.0 * square, 0.0)
-
-
-@njit(cache=True)
-def _apart(positions, a, b):
-    square = 0.0
-    for axis in range(3):
-        square += (positions[a, axis] - positions[b, axis]) ** 2
-    return math.sqrt(square)
+            own = apart(rest, RIGID[k, 0], RIGID[k, 1])
+            square_off = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / CORRELATION_FRAMES, 1.0)
+            length_variance[s, k] = max(square_off, 0.0) + max(variance[k] - noise[k] - 2.0 * square, 0.0)

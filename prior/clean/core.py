@@ -36,27 +36,16 @@ reset."""
 
 
 class _Newest(NamedTuple):
-    """Results of the newest frame, used for it and for the frames that are still to be published.
-
-    Attributes:
-        gated: the frame.
-        present: (S,) which slots hold a body.
-        person: the bodies' bones.
-        bias: the sensor's bias, estimated up to this frame.
-        left_out: (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit.
-        rotations: (K, S, 22, 3, 3) local, of the last frames.
-        score: of the newest frame.
-        imputed: the last frames, completed; None if the impute stage is off.
-    """
+    """Results of the newest frame, used for it and for the frames that are still to be published."""
 
     gated: Gated
-    present: Bools
+    present: Bools  # (S,) which slots hold a body
     person: Person
-    bias: SensorBias
-    left_out: Floats
-    rotations: Floats
+    bias: SensorBias  # estimated up to this frame
+    left_out: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
+    rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
-    imputed: Imputed | None
+    imputed: Imputed | None  # the last frames, completed; None if the impute stage is off
 
 
 class CleanCore:

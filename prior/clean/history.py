@@ -44,11 +44,6 @@ class Ring:
         """The newest frame."""
         return self._data[(self._next - 1) % self._frames]
 
-    def replace(self, frame: NDArray[np.floating]) -> None:
-        """Overwrite the newest frame."""
-        last = (self._next - 1) % self._frames
-        self._data[last] = self._data[last + self._frames] = frame
-
     def amend(self, back: int, slot: int, values: NDArray[np.floating]) -> None:
         """Overwrite one slot (the first axis of a frame) in the frame ``back`` frames before the newest."""
         at = (self._next - 1 - back) % self._frames

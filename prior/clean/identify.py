@@ -61,10 +61,10 @@ class Identify:
     """Assigns an id to each body of a frame.
 
     Each row holds a track: a person, or a tentative track without an id. A constant-velocity Kalman filter predicts
-        each
-    track's position. Bodies are first matched by position to tracks observed within `RECENT_S`. Each unmatched body
-    starts a tentative track. After ``birth`` seconds, or as soon as the score is decisive, a tentative track is either
-    recognised as a person out of sight or becomes a new person. The wait lets bone lengths average over several frames.
+    each track's position. Bodies are first matched by position to tracks observed within `RECENT_S`. Each unmatched
+    body starts a tentative track. After ``birth`` seconds, or as soon as the score is decisive, a tentative track is
+    either recognised as a person out of sight or becomes a new person. The wait lets bone lengths average over several
+    frames.
 
     Args:
         settings: settings of this stage.
@@ -123,8 +123,7 @@ class Identify:
     def _follow(self, bodies: Floats, now: float) -> tuple[NDArray[np.intp], Floats, Floats]:
         """Match bodies to tracks observed within `RECENT_S`.
 
-        Returns:
-            (N,) row of each body or -1, (N, 3) its position in metres, and (rows, N) score by position of all pairs.
+        Returns (N,) row of each body or -1, (N, 3) its position, and (rows, N) score by position of all pairs.
         """
         row_of, places = np.full(len(bodies), -1), np.full((len(bodies), 3), np.nan)
         score = np.full((self._rows, len(bodies)), -np.inf)
@@ -240,15 +239,9 @@ def _middle(body: Floats) -> Floats:
 
 
 def _unobserved(last: Floats, coasting: Floats, sigma: Floats, unobserved_s: Floats) -> tuple[Floats, Floats]:
-    """Predict bodies out of sight, with an Ornstein-Uhlenbeck velocity instead of a constant one.
+    """Predict bodies out of sight, last observed at (R, 3), with an Ornstein-Uhlenbeck velocity, not a constant one.
 
-    Args:
-        last: (R, 3) metres, last observed position.
-        coasting: (R, 3) metres, prediction at constant velocity, with ``sigma`` (R,) along an axis.
-        unobserved_s: (R,) seconds since the last observation.
-
-    Returns:
-        (R, 3) metres, and the standard deviation along an axis (R,).
+    ``coasting`` (R, 3) and ``sigma`` (R,) are the prediction at constant velocity and its deviation along an axis.
     """
     age = np.maximum(unobserved_s / SPEED_MEMORY_S, 1e-6)
     forgotten = 1.0 - np.exp(-age)

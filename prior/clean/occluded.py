@@ -132,7 +132,7 @@ class OccludedJoints:
             track: the observations of all slots.
         """
         held = np.empty_like(seen)
-        _observe(self._past, slots, seen, sigma, unseen_s, held)
+        observe(self._past, slots, seen, sigma, unseen_s, held)
         if completed_sigma is None:
             return None
         known = np.isfinite(completed_sigma + completed[..., 0])
@@ -140,9 +140,9 @@ class OccludedJoints:
         occluded = (
             known & (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(unseen_s + sigma + held[..., 0])
         )
-        _average(self._past, slots, never, completed, held)
+        average(self._past, slots, never, completed, held)
         placed = held.copy()
-        _stand(never, seen, unseen_s, placed)
+        stand(never, seen, unseen_s, placed)
         self._place_arms(never, np.where(np.isfinite(held), held, completed), sigma, unseen_s, offsets, placed)
         bridged, bridged_sigma = seen.copy(), sigma.copy()
         _bridge(slots, occluded & seen_later, *track, bridged, bridged_sigma)
@@ -198,24 +198,6 @@ def _of_unseen_limbs(never: Bools) -> Floats:
     for _, *arm in _ARMS:
         factors[:, arm] = np.where(never[:, arm].all(axis=1), _UNSEEN_ARM, 1.0)[:, None]
     return factors
-
-
-@njit(cache=True)
-def _observe(past, slots, seen, sigma, unseen_s, held):
-    for row, slot in enumerate(slots):
-        observe(past, slot, seen[row], sigma[row], unseen_s[row], held[row])
-
-
-@njit(cache=True)
-def _average(past, slots, never, completed, held):
-    for row, slot in enumerate(slots):
-        average(past, slot, never[row], completed[row], held[row])
-
-
-@njit(cache=True)
-def _stand(never, seen, unseen_s, placed):
-    for row in range(len(never)):
-        stand(never[row], seen[row], unseen_s[row], placed[row])
 
 
 @njit(cache=True)

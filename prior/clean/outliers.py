@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
+from steadypose.prior.body.vectors import apart
 from steadypose.prior.compiled import median, njit
 
 MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0
@@ -109,21 +110,12 @@ class BoneOutliers:
 
 
 @njit(cache=True)
-def _length(positions, joint):
-    """Metres from a joint of positions (22, 3) to its parent; NaN if either is unobserved."""
-    square = 0.0
-    for axis in range(3):
-        square += (positions[joint, axis] - positions[PARENT[joint], axis]) ** 2
-    return math.sqrt(square)
-
-
-@njit(cache=True)
 def _hold(positions, distance, mean, variance, observed, moved):
     for row in range(len(positions)):
         bones = np.zeros(len(PARENT), dtype=np.int64)
         moved[row] = True
         for joint in range(1, len(PARENT)):
-            off = abs(_length(positions[row], joint) - mean[row, joint])
+            off = abs(apart(positions[row], joint, PARENT[joint]) - mean[row, joint])
             if not math.isfinite(off):
                 continue
             deviation = math.sqrt(variance[row, joint])
@@ -140,7 +132,7 @@ def _judge(positions, mean, variance, observed, bad):
     for row in range(len(positions)):
         seen, outliers = 0, 0
         for joint in range(1, len(PARENT)):
-            off = _length(positions[row], joint) - mean[row, joint]
+            off = apart(positions[row], joint, PARENT[joint]) - mean[row, joint]
             if not math.isfinite(off):
                 continue
             observed[row, joint] += 1

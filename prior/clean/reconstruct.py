@@ -157,13 +157,10 @@ class Denoise:
 
 @njit(cache=True)
 def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames, before):
-    """Denoise the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place (see
-    `Denoise._denoised`).
+    """Denoise the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place: see `Denoise._denoised`.
 
-    Args:
-        late: HG-VAE's lag, frames.
-        apart, frames: (S, 22) state of the running mean of the squared distance between the two estimates, updated.
-        before: (S, 22, 3) metres, the smoother's estimate one frame earlier.
+    ``late`` is HG-VAE's lag in frames, ``apart`` and ``frames`` are the state of the running mean, and ``before`` is
+    the smoother's estimate one frame earlier.
     """
     moved = np.empty(3)
     for slot in range(len(positions)):
@@ -189,15 +186,10 @@ def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames,
 
 @njit(cache=True)
 def _place_pelvis(reconstructed, seen):
-    """Replace the reconstructed pelvis, in place, with the mean of hips and spine less their mean observed offsets.
+    """Replace the pelvis (B, K, 22, 3), in place, with the mean of hips and spine less their mean observed offsets.
 
-    The tracks of other joints are relative to the trunk's path, but the pelvis's track is relative to that path's mean.
-    No other joint therefore informs HG-VAE of the pelvis's noise, and it removes less of it than of other joints'
-    noise.
-
-    Args:
-        reconstructed: (B, K, 22, 3) metres, the newest frames.
-        seen: (B, T, 22, 3) metres, observed; NaN where not.
+    The pelvis's track is relative to the mean of the trunk's path, the other tracks to the path itself. No other joint
+    therefore informs HG-VAE of the pelvis's noise. ``seen`` (B, T, 22, 3) are the observations.
     """
     joints = len(_BESIDE_PELVIS)
     lies, counts = np.empty((joints, 3)), np.empty(joints)

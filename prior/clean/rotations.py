@@ -11,13 +11,12 @@ whole body's posture. Filters hold the twist of straight limbs and the usual dir
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations, heading, yaw_matrix
 from steadypose.prior.body.rotation_filters import follow_short_bones, follow_twist, unknown_turns, unknown_twist
@@ -25,7 +24,6 @@ from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.clean.settings import OrientSettings, RefineSettings
-from steadypose.prior.compiled import njit
 from steadypose.prior.models.hmvae import LiveHMVAE
 from steadypose.prior.models.posture import LivePosture, average_root
 
@@ -58,13 +56,15 @@ class Refine:
         kept = self._window // 2 + 1  # from the centre on; earlier frames stay as decoded when they were the centre
         self._decoded[:-1] = self._decoded[1:]
         frames = self._solved.all[:, slots]
-        _repeat_first(frames)
         if self._reconstruct and len(slots):
+            first = np.isnan(frames[..., 0, 0, 0]).sum(axis=0)  # of a new body
+            frames = frames[np.maximum(np.arange(self._window)[:, None], first), np.arange(len(slots))]
             # remove the heading of the centre frame, as in training; only the root's rotation contains it
             back = yaw_matrix(heading(frames[self._window // 2 - 1, :, 0]))
-            x = np.empty((len(slots), self._window, 22, 6), dtype=np.float32)
-            _facing_forward(frames, back, x)
-            frames = rotations_of(self._reconstruct(x)[:, -kept:], back)
+            frames[:, :, 0] = _product(back.swapaxes(-1, -2), frames[:, :, 0])
+            x = frames[..., :2].swapaxes(-1, -2).reshape(*frames.shape[:3], 6).swapaxes(0, 1).astype(np.float32)
+            frames = _rotations_of(self._reconstruct(x)[:, -kept:].swapaxes(0, 1))
+            frames[:, :, 0] = _product(back, frames[:, :, 0])
         self._decoded[-kept:, slots] = frames[-kept:]
         return self._decoded
 
@@ -108,73 +108,15 @@ class Orient:
         return replace(estimate, rotations=rotations)
 
 
-@njit(cache=True)
-def _repeat_first(frames):
-    """Fill the frames (T, B, 22, 3, 3) before a new body's first frame with that frame."""
-    for row in range(frames.shape[1]):
-        first = 0
-        while first < len(frames) - 1 and math.isnan(frames[first, row, 0, 0, 0]):
-            first += 1
-        for t in range(first):
-            for joint in range(frames.shape[2]):
-                for i in range(3):
-                    for j in range(3):
-                        frames[t, row, joint, i, j] = frames[first, row, joint, i, j]
+def _product(a: Floats, b: Floats) -> Floats:
+    """Return ``a @ b``. The product of matrices in BLAS rounds differently on each processor."""
+    return (a[..., None] * b[..., None, :, :]).sum(axis=-2)
 
 
-@njit(cache=True)
-def _facing_forward(frames, back, x):
-    """Write the first two columns of rotations (T, B, 22, 3, 3) to ``x`` (B, T, 22, 6), like the network's `to_6d`.
-
-    The root's rotations are turned by the inverse of ``back`` (B, 3, 3).
-    """
-    for row in range(len(x)):
-        for t in range(len(frames)):
-            for column in range(2):
-                for i in range(3):
-                    turned = 0.0
-                    for k in range(3):
-                        turned += back[row, k, i] * frames[t, row, 0, k, column]
-                    x[row, t, 0, 3 * column + i] = turned
-                    for joint in range(1, 22):
-                        x[row, t, joint, 3 * column + i] = frames[t, row, joint, i, column]
-
-
-@njit(cache=True)
-def rotations_of(x, back):
-    """(T, B, 22, 3, 3) rotations of ``x`` (B, T, 22, 6), like the network's `from_6d`, with the root turned by
-    ``back``."""
-    rotations = np.empty((x.shape[1], len(x), 22, 3, 3))
-    root = np.empty((3, 3))
-    for row in range(len(x)):
-        for t in range(x.shape[1]):
-            for joint in range(22):
-                _orthonormal(x[row, t, joint], rotations[t, row, joint])
-            for i in range(3):
-                for j in range(3):
-                    root[i, j] = rotations[t, row, 0, i, j]
-            for i in range(3):
-                for j in range(3):
-                    rotations[t, row, 0, i, j] = (
-                        back[row, i, 0] * root[0, j] + back[row, i, 1] * root[1, j] + back[row, i, 2] * root[2, j]
-                    )
-    return rotations
-
-
-@njit(cache=True)
-def _orthonormal(x, r):
-    """Write the rotation ``r`` (3, 3) that Gram-Schmidt orthonormalisation of the two columns ``x`` (6,) gives."""
-    along = length = rest = 0.0
-    for i in range(3):
-        length += x[i] * x[i]
-    for i in range(3):
-        r[i, 0] = x[i] / max(math.sqrt(length), 1e-12)
-        along += r[i, 0] * x[3 + i]
-    for i in range(3):
-        r[i, 1] = x[3 + i] - along * r[i, 0]
-        rest += r[i, 1] * r[i, 1]
-    for i in range(3):
-        r[i, 1] /= max(math.sqrt(rest), 1e-12)
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        r[i, 2] = r[a, 0] * r[b, 1] - r[b, 0] * r[a, 1]
+def _rotations_of(x: Floats32) -> Floats:
+    """Convert first two columns (..., 6) to rotations (..., 3, 3), like the network's `from_6d`."""
+    first, second = x[..., :3], x[..., 3:]
+    first = first / np.sqrt(np.square(first).sum(axis=-1, keepdims=True, dtype=np.float64))
+    second = second - (first * second).sum(axis=-1, keepdims=True) * first
+    second /= np.linalg.norm(second, axis=-1, keepdims=True)
+    return np.stack([first, second, np.cross(first, second)], axis=-1)

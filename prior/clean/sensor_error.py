@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import PARENTS, finite_joints
+from steadypose.prior.body.skeleton import PARENT, finite_joints
 from steadypose.prior.clean.frame import Gated
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.clean.settings import CorrectSettings
@@ -43,7 +43,7 @@ LEFT_OUT = 3.0
 """Ratio of the missing variance along an axis to the difference of the eigenvalues. It exceeds 1 because lengths do not
 show errors that last longer than their running mean, or that both ends share."""
 
-_PARENTS = np.array(PARENTS[1:])
+_BONES = len(PARENT) - 1
 _ENTRIES = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 """Index of each entry of a symmetric 3 × 3 matrix in the vector of its six distinct entries."""
 _ISOTROPIC = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
@@ -91,7 +91,7 @@ class DepthError:
     """
 
     def __init__(self, slots: int) -> None:
-        self._frames, self._length = np.zeros((2, slots, len(_PARENTS)))
+        self._frames, self._length = np.zeros((2, slots, _BONES))
         self._normal, self._right = np.zeros((slots, 6, 6)), np.zeros((slots, 6))
         self._total = np.zeros((2, slots))  # number of bones, and sum of half their squared residuals
 
@@ -112,7 +112,7 @@ class DepthError:
             return np.zeros(len(white))
         _take_in(smoothed.positions, smoothed.sigma, self._frames, self._length, self._normal, self._right, self._total)
         count, squares = self._total
-        ridge = RIDGE * count + PRIOR * len(_PARENTS)
+        ridge = RIDGE * count + PRIOR * _BONES
         mean = squares / np.maximum(count, 1.0)
         normal = self._normal + ridge[:, None, None] * np.diag(_TWICE)
         form = np.linalg.solve(normal, (self._right + (ridge * mean)[:, None] * _ISOTROPIC)[..., None])[..., 0]
@@ -132,8 +132,8 @@ def _take_in(positions, sigma, frames, length, normal, right, total):
                 normal[slot, i, j] *= keep
         total[0, slot] *= keep
         total[1, slot] *= keep
-        for k in range(len(_PARENTS)):
-            joint, above = k + 1, _PARENTS[k]
+        for k in range(_BONES):
+            joint, above = k + 1, PARENT[k + 1]
             x = positions[slot, joint, 0] - positions[slot, above, 0]
             y = positions[slot, joint, 1] - positions[slot, above, 1]
             z = positions[slot, joint, 2] - positions[slot, above, 2]

@@ -27,11 +27,7 @@ completion have ten times the acceleration of real ones."""
 
 
 class PartsCompleter:
-    """Completes windows, with the interface of `LiveCompleter`.
-
-    Args:
-        completer: the completer of gaps and parts.
-        weights: weight set of HG-VAE.
+    """Completes windows, with the interface of `LiveCompleter`, and with weights of HG-VAE.
 
     Raises:
         FileNotFoundError: there are no such weights.

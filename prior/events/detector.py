@@ -97,11 +97,7 @@ CERTAIN = 1e-6
 
 
 class EventDetector:
-    """Detects the events of one ``pose/world`` stream causally, from the messages so far.
-
-    Args:
-        settings: the thresholds.
-    """
+    """Detects the events of one ``pose/world`` stream causally, from the messages so far."""
 
     def __init__(self, settings: EventSettings | None = None) -> None:
         self._settings = settings or EventSettings()

@@ -111,7 +111,7 @@ def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, des
         RigError: a described joint is missing, or no body is recognised.
     """
     if description.canonical:
-        named = _described("described", joints, description.canonical)
+        named = _described(joints, description.canonical)
         if not description.metres:
             raise RigError("rig: expected metres, the size of the file's unit, beside [canonical]")
         return Rig(named, description.metres)
@@ -120,11 +120,11 @@ def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, des
     return recognise(Tree(joints, parents, offsets))
 
 
-def _described(name: str, joints: Sequence[str], canonical: Mapping[str, str | Sequence[str]]) -> Skeleton:
+def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str]]) -> Skeleton:
     sources = {joint: [given] if isinstance(given, str) else list(given) for joint, given in canonical.items()}
     if missing := [n for names in sources.values() for n in names if n not in joints]:
         raise RigError(f"rig [canonical]: expected names of joints, the file has no {', '.join(missing)}")
-    return Skeleton(name, tuple(joints), {joint: dict.fromkeys(names, 1.0) for joint, names in sources.items()})
+    return Skeleton("described", tuple(joints), {joint: dict.fromkeys(names, 1.0) for joint, names in sources.items()})
 
 
 def _bvh(content: bytes, description: Description) -> _Read:
@@ -214,7 +214,7 @@ def _points(fps: float, names: Sequence[str], points: Floats, units: str, descri
     """Read named points, which are skin markers of the Plug-in-Gait set or joints."""
     metres = description.metres or POINT_UNITS.get(units.strip().lower(), 0.001)
     if description.canonical:
-        return fps, _described("described", names, description.canonical), points * metres, ""
+        return fps, _described(names, description.canonical), points * metres, ""
     if set(MARKERS) <= set(names):
         markers = {name: points[:, names.index(name)] * metres for name in MARKERS}
         return fps, CANONICAL, joint_centres(markers, calibrate([markers])), ""

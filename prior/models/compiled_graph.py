@@ -89,13 +89,7 @@ class Program:
         return self.linear(of, layer["weight"], layer["bias"], layer["adjacency"], plus, onto, active)
 
     def block(self, of: int, block: Arrays, *, onto: int) -> int:
-        """Add a graph convolutional block (equation 5), written to ``onto``, which may be ``of``.
-
-        Args:
-            of: matrix read.
-            block: weights of a `GraphBlock`.
-            onto: matrix written.
-        """
+        """Add a `GraphBlock` (equation 5) of a matrix, written to ``onto``, which may be the same."""
         inner = self.layer(self.layer(of, part(block, "first")), part(block, "second"), active=True)
         return self._step(_GELU, onto, inner, self._store(block["alpha"]), of)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.timing.rate import FPS
 
 JOINTS = 22
+Float = TypeVar("Float", np.float32, np.float64)
 
 BENDS = JOINTS * 6 + 3
 """Number of values in a frame's bend: first two columns of each rotation, and the root's position."""
@@ -220,7 +221,7 @@ def anchored(values: Floats, line: Line, tracks: slice) -> Floats:
     return values - _lerp(values, line, tracks)
 
 
-def rotations_of_6d(x: Floats) -> Floats:
+def rotations_of_6d(x: NDArray[Float]) -> NDArray[Float]:
     """Convert first two columns (..., 6) to rotations (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
     first = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
     second = x[..., 3:] - (first * x[..., 3:]).sum(axis=-1, keepdims=True) * first

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats, Floats32
-from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, yaw_matrix
 from steadypose.prior.body.skeleton import finite_joints
-from steadypose.prior.models.recurrent import LiveRecurrent, sigmoid
+from steadypose.prior.models.layers import LiveRecurrent, sigmoid
 from steadypose.prior.models.weights import Arrays, load_weights
 
 OF_JOINT = 12
@@ -58,10 +58,7 @@ def contact_features(
     joints, joints_before = positions[:, _JOINTS], before[:, _JOINTS]
     known = finite_joints(joints) & finite_joints(joints_before)
     step = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(positions),))[:, None, None]
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    back = np.zeros((len(positions), 3, 3))  # p @ back turns p so that the body faces +x
-    back[:, 0, 0] = back[:, 1, 1] = cos
-    back[:, 0, 1], back[:, 1, 0], back[:, 2, 2] = -sin, sin, 1.0
+    back = yaw_matrix(yaw)  # p @ back turns p so that the body faces +x
     from_root, from_root_before = joints - positions[:, :1], joints_before - before[:, :1]
     seen = root_seen[:, None, None] > 0
     velocity = np.where(seen, (joints - joints_before) / step, np.nan)

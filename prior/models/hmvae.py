@@ -16,6 +16,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.models.completer_features import rotations_of_6d
 from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_matrix, pooling_levels, unpool_matrix
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
@@ -81,12 +82,7 @@ class HMVAEConfig:
 
 
 class LiveHMVAE:
-    """Reconstruction by a trained `HMVAE`.
-
-    Args:
-        config: its sizes.
-        weights: its state dict, which is folded.
-    """
+    """Reconstruction by a trained `HMVAE`, whose weights are folded."""
 
     def __init__(self, config: HMVAEConfig, weights: Arrays) -> None:
         self.window, self._about_mean = config.window, config.about_mean
@@ -152,22 +148,13 @@ class LiveHMVAE:
         return _columns(decoded * np.float32(DEVIATION) + _NO_ROTATION, mean.swapaxes(-1, -2))
 
 
-def _rotations(x: Floats32) -> Floats32:
-    """(..., 3, 3) rotations from first two columns (..., 6), by Gram-Schmidt."""
-    first, second = x[..., :3], x[..., 3:]
-    first = first / np.maximum(np.linalg.norm(first, axis=-1, keepdims=True), 1e-12)
-    second = second - (first * second).sum(axis=-1, keepdims=True) * first
-    second = second / np.maximum(np.linalg.norm(second, axis=-1, keepdims=True), 1e-12)
-    return np.stack([first, second, np.cross(first, second)], axis=-1)
-
-
 def _mean_pose(x: Floats32) -> Floats32:
     """(B, 1, 22, 3, 3) local rotations of the mean of bones' orientations in windows x (B, T, 22, 6)."""
-    local = _rotations(x)
+    local = rotations_of_6d(x)
     orientations = local.copy()
     for joint, parent in enumerate(PARENTS[1:], start=1):
         orientations[:, :, joint] = orientations[:, :, parent] @ local[:, :, joint]
-    mean = _rotations(_first_two(orientations).mean(axis=1, keepdims=True))
+    mean = rotations_of_6d(_first_two(orientations).mean(axis=1, keepdims=True))
     local = mean.copy()
     local[:, :, 1:] = mean[:, :, list(PARENTS[1:])].swapaxes(-1, -2) @ mean[:, :, 1:]
     return local
@@ -184,13 +171,9 @@ def _columns(x: Floats32, frame: Floats32) -> Floats32:
 
 
 class _TemporalLinear:
-    """A convolution as two products. ``over_time`` (T' * taps, T) gathers the inputs of each output frame.
+    """A convolution (out, in, kernel) as two products, the first of which gathers the inputs of each output frame.
 
-    Args:
-        weight: (out, in, kernel)
-        bias: (out,) or (1,)
-        stretch: (T', T) preceding linear operation over time; its ends are reflected.
-        stride: stride in time.
+    ``stretch`` (T', T) is a preceding linear operation over time; its ends are reflected.
     """
 
     def __init__(self, weight: Floats32, bias: Floats32, stretch: Floats32, stride: int = 1) -> None:
@@ -225,11 +208,7 @@ class _Latent:
 
 
 class _Affine:
-    """An affine function of a latent, folded into one product: (B, E * latent) to (B, T, out).
-
-    Args:
-        function: the affine function, (B, E, latent) to (B, T, out).
-    """
+    """An affine function of a latent, (B, E, latent) to (B, T, out), folded into one product."""
 
     def __init__(self, function: Callable[[Floats32], Floats32], edges: int, latent: int) -> None:
         size = edges * latent

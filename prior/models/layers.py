@@ -1,4 +1,4 @@
-"""Layers that live networks share: dense products, activations, and pooling over the edges of a skeleton.
+"""Layers that live networks share: dense products, activations, a recurrent unit, and pooling over a skeleton's edges.
 
 An edge is the bone that ends in a joint, and it carries that joint's features. The root has a virtual edge.
 Neighbourhoods and pooling pairs are derived from the skeleton's graph (HM-VAE, section 3.1).
@@ -10,15 +10,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.weights import Arrays
 
 FEW_ROWS = 2
 """Largest number of rows for which products without BLAS take half the time; BLAS copies the weights first."""
 
 SLOPE = 0.2
 """Slope of the LeakyReLU for negative values."""
+
+BLOCKS, NEAR = 4, 2
+"""Number of HM-VAE's blocks, and distance within which edges are mixed by a convolution over the skeleton, edges."""
 
 
 def dense(x: Floats32, weight: Floats32, bias: Floats32) -> Floats32:
@@ -46,56 +51,41 @@ def leaky_relu(x: Floats32) -> Floats32:
     return np.maximum(x, np.float32(SLOPE) * x)
 
 
-@dataclass(frozen=True)
-class EdgeGraph:
-    """The edges of a skeleton as a tree. ``parents[e]`` is the edge towards the root, -1 for the root's own edge."""
+class LiveRecurrent:
+    """A trained network of torch's ``GRU`` and ``Linear``.
 
-    parents: tuple[int, ...]
+    Args:
+        weights: its state dict, with the linear layer as ``head``.
+        unit: name of the GRU in the state dict.
 
-    def neighbours(self, distance: int = 2) -> list[list[int]]:
-        """Return each edge's edges within ``distance``, including itself; edges that share a joint are 1 apart."""
-        touching = [
-            {o for o, q in enumerate(self.parents) if o != e and (q in (e, p) or o == p)}
-            for e, p in enumerate(self.parents)
-        ]
-        result = []
-        for edge in range(len(self.parents)):
-            near = {edge}
-            for _ in range(distance):
-                near |= {o for e in near for o in touching[e]}
-            result.append(sorted(near))
-        return result
+    Attributes:
+        hidden: size of a body's hidden state, which is zero before the first frame.
+    """
 
-    def pool(self) -> tuple[EdgeGraph, list[list[int]]]:
-        """Merge pairs of edges joined by a joint of degree two, walking each chain from the root's side.
+    def __init__(self, weights: Arrays, unit: str) -> None:
+        self._input = weights[f"{unit}.weight_ih_l0"], weights[f"{unit}.bias_ih_l0"]
+        self._kept = weights[f"{unit}.weight_hh_l0"], weights[f"{unit}.bias_hh_l0"]
+        self._head = weights["head.weight"], weights["head.bias"]
+        self.hidden = weights["head.weight"].shape[1]
 
-        In a chain of odd length, the first edge is not merged, as in the official code. The virtual root edge is never
-        merged.
+    def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> tuple[Floats32, Floats32]:
+        """Return the head's outputs (B, O) for one frame's features (B, F), and the next hidden state (B, `hidden`)."""
+        reset_in, update_in, new_in = np.split(dense(features, *self._input), 3, axis=-1)
+        reset_kept, update_kept, new_kept = np.split(dense(state, *self._kept), 3, axis=-1)
+        new = np.tanh(new_in + sigmoid(reset_in + reset_kept) * new_kept)
+        state = new + sigmoid(update_in + update_kept) * (state - new)
+        return dense(state, *self._head), state
 
-        Returns:
-            The pooled graph, and for each of its edges the edges that it merges.
-        """
-        children = [[c for c, p in enumerate(self.parents) if p == e] for e in range(len(self.parents))]
-        groups: list[list[int]] = [[0]]
-        for start, parent in enumerate(self.parents):
-            if parent < 0 or (parent != 0 and len(children[parent]) == 1):
-                continue
-            chain = [start]
-            while len(children[chain[-1]]) == 1:
-                chain.append(children[chain[-1]][0])
-            odd = len(chain) % 2
-            groups += [chain[:1]] * odd + [chain[k : k + 2] for k in range(odd, len(chain), 2)]
-        groups.sort()
-        group_of = {edge: g for g, group in enumerate(groups) for edge in group}
-        parents = tuple(-1 if self.parents[g[0]] < 0 else group_of[self.parents[g[0]]] for g in groups)
-        return EdgeGraph(parents), groups
+
+def sigmoid(x: Floats32) -> Floats32:
+    """The logistic function."""
+    return (1.0 / (1.0 + np.exp(-x))).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Level:
-    """The graph of one building block: the neighbours of each edge, and the edges that merge after the block."""
+    """One building block: the neighbours of each edge, and the edges that merge after the block."""
 
-    graph: EdgeGraph
     neighbours: list[list[int]]
     groups: list[list[int]]
 
@@ -104,15 +94,49 @@ class Level:
         return len(self.neighbours)
 
 
-def pooling_levels(parents: Sequence[int], blocks: int = 4, distance: int = 2) -> list[Level]:
-    """Return the levels of an encoder of ``blocks`` blocks. When no chain is left to merge, pooling is the identity."""
-    graph = EdgeGraph(tuple(parents))
+def pooling_levels(parents: Sequence[int]) -> list[Level]:
+    """Return the levels of an encoder of four blocks. When no chain is left to merge, pooling is the identity.
+
+    Args:
+        parents: the edge towards the root from each edge; -1 for the root's own edge.
+    """
     levels = []
-    for _ in range(blocks):
-        pooled, groups = graph.pool()
-        levels.append(Level(graph, graph.neighbours(distance), groups))
-        graph = pooled
+    for _ in range(BLOCKS):
+        levels.append(Level(_neighbours(parents), _groups(parents)))
+        group_of = {edge: g for g, group in enumerate(levels[-1].groups) for edge in group}
+        towards_root = [parents[group[0]] for group in levels[-1].groups]
+        parents = [-1 if parent < 0 else group_of[parent] for parent in towards_root]
     return levels
+
+
+def _neighbours(parents: Sequence[int]) -> list[list[int]]:
+    """Return each edge's edges within `NEAR`, including itself; edges that share a joint are 1 apart."""
+    touching = [{o for o, q in enumerate(parents) if o != e and (q in (e, p) or o == p)} for e, p in enumerate(parents)]
+    result = []
+    for edge in range(len(parents)):
+        near = {edge}
+        for _ in range(NEAR):
+            near |= {o for e in near for o in touching[e]}
+        result.append(sorted(near))
+    return result
+
+
+def _groups(parents: Sequence[int]) -> list[list[int]]:
+    """Return pairs of edges joined by a joint of degree two, walking each chain from the root's side, and all others.
+
+    In a chain of odd length, the first edge stays alone, as in the official code; so does the virtual root edge.
+    """
+    children = [[c for c, p in enumerate(parents) if p == e] for e in range(len(parents))]
+    groups: list[list[int]] = [[0]]
+    for start, parent in enumerate(parents):
+        if parent < 0 or (parent != 0 and len(children[parent]) == 1):
+            continue
+        chain = [start]
+        while len(children[chain[-1]]) == 1:
+            chain.append(children[chain[-1]][0])
+        odd = len(chain) % 2
+        groups += [chain[:1]] * odd + [chain[k : k + 2] for k in range(odd, len(chain), 2)]
+    return sorted(groups)
 
 
 def pool_matrix(groups: Sequence[Sequence[int]]) -> Floats32:

@@ -119,14 +119,10 @@ def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: 
         sigma: (B, 22) metres, their standard deviations along an axis.
         offsets: (B, 22, 3) metres, the bones.
     """
-    known, rigid = expected.root_covariance + np.diag(WITHIN**2), _rigid_covariance(sigma, offsets)
+    known, rigid = expected.root_covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
     off = to_rotation_vectors(expected.root.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
     share = known @ np.linalg.inv(known + rigid)
     return expected.root @ from_rotation_vectors((share @ off[..., None])[..., 0])
-
-
-def _rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
-    return rigid_covariance(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA), offsets)
 
 
 class RootCovariance:
@@ -150,7 +146,7 @@ class RootCovariance:
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0
         known = self._posture(positions, sigma, bones).root_covariance + np.diag(WITHIN**2)
-        rigid = _rigid_covariance(sigma, bones @ root)
+        rigid = rigid_covariance(sigma, bones @ root)
         covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
         return root @ covariance @ root.swapaxes(-1, -2)
 
@@ -315,7 +311,7 @@ def rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
     To first order, the rotation vector is M^-1 sum(b x e) for bones b and errors e, with M = sum(|b|² I - b b^T).
     """
     moved, moments = np.empty((2, len(offsets), 3, 3))
-    _moments(sigma, offsets, moved, moments)
+    _moments(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA), offsets, moved, moments)
     inverse = np.linalg.inv(moments)
     return inverse @ moved @ inverse
 

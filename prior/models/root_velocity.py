@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.models.recurrent import LiveRecurrent
+from steadypose.prior.models.layers import LiveRecurrent
 from steadypose.prior.models.weights import Arrays, load_weights
 from steadypose.prior.timing.rate import FPS
 
@@ -81,12 +81,7 @@ def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: F
 
 
 class LiveRootVelocity:
-    """A trained `TrajectoryNet`.
-
-    Args:
-        config: its size and errors.
-        weights: its state dict.
-    """
+    """A trained `TrajectoryNet`."""
 
     def __init__(self, config: TrajectoryConfig, weights: Arrays) -> None:
         self.config = config

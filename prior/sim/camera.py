@@ -113,12 +113,10 @@ class Sight:
 
     Attributes:
         hidden: 0 if visible, 1 behind a body, between 0 and 1 at its edge.
-        in_front: metres, depth of the occluding surface; infinite if there is none.
         beside: metres, depth of the nearest other surface that the ray almost touches; infinite if there is none.
     """
 
     hidden: Floats
-    in_front: Floats
     beside: Floats
 
 
@@ -127,8 +125,7 @@ def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
 
     A capsule that contains the point itself (a joint inside its own limb) does not hide it.
     """
-    shape = points.shape[:-1]
-    hidden, in_front, beside = np.zeros(shape), np.full(shape, np.inf), np.full(shape, np.inf)
+    hidden, beside = np.zeros(points.shape[:-1]), np.full(points.shape[:-1], np.inf)
     reach = np.linalg.norm(points - position, axis=-1)
     for body in bodies:
         scale = stature(body.offsets) / REST_HEIGHT
@@ -141,11 +138,10 @@ def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
             ahead = ~own & (depth < reach - 0.3 * radius)
             cover = np.where(ahead, np.clip((radius - gap) / (0.35 * radius) + 0.5, 0.0, 1.0), 0.0)
             surface = depth - np.sqrt(np.maximum(radius**2 - gap**2, 0.0))
-            in_front = np.where((cover > 0.5) & (surface < in_front), surface, in_front)
             hidden = np.maximum(hidden, cover)
             grazed = ~own & (gap < 1.6 * radius)
             beside = np.where(grazed & (surface < beside), surface, beside)
-    return Sight(hidden, in_front, beside)
+    return Sight(hidden, beside)
 
 
 def segment_gap(p: Floats, q: Floats, a: Floats, b: Floats) -> tuple[Floats, Floats]:

@@ -201,10 +201,7 @@ def crossing(rng: np.random.Generator) -> list[Motion]:
 
     near = there_and_back(2.2, -0.95, 0.95, 0.8, np.pi)
     far = there_and_back(3.2, 1.3, 1.15, 0.5, -np.pi)
-    motions = [perform(Intent(p), _person(rng), rng) for p in (near, far)]
-    last = min(m.times[-1] for m in motions)
-    times = np.arange(int(last * RATE) + 1) / RATE
-    return [m.at(times) for m in motions]
+    return _together(rng, near, far)
 
 
 def hidden_crossing(rng: np.random.Generator) -> list[Motion]:
@@ -219,10 +216,15 @@ def hidden_crossing(rng: np.random.Generator) -> list[Motion]:
         parts += [Turn(np.pi, 1.6)] if back else []
         return plan((x, y), -np.sign(y) * np.pi / 2, [*parts, Walk([(x, y if back else -y)], pace), Stand(3.0)])
 
-    plans = [
+    return _together(
+        rng,
         visit(near, side * rng.uniform(0.8, 1.0), 0.5, rng.uniform(3.5, 4.5), back=False),
         visit(far, other * rng.uniform(1.2, 1.5), rng.uniform(1.0, 1.5), rng.uniform(0.0, 0.4), turns_back),
-    ]
+    )
+
+
+def _together(rng: np.random.Generator, *plans: Plan) -> list[Motion]:
+    """Perform each plan with another body, as long as the shortest lasts."""
     motions = [perform(Intent(p), _person(rng), rng) for p in plans]
     times = np.arange(int(min(m.times[-1] for m in motions) * RATE) + 1) / RATE
     return [m.at(times) for m in motions]

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.compiled import njit
 
+INITIAL_SPEED = 1.0
+"""Standard deviation of a joint's first velocity along an axis, m/s."""
+
 
 class Smoothed(NamedTuple):
     """The estimate of one frame.
@@ -31,24 +34,16 @@ class ConstantVelocityFilter:
 
     The process is white-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, equation 6.2.2-12). The measurement is
     a position with an isotropic error. The three coordinates of a joint therefore share one 2x2 covariance. A joint
-    starts at its first measurement, with a velocity of 0 +- ``initial_speed``. A missing joint coasts, and its standard
+    starts at its first measurement, with a velocity of 0 +- `INITIAL_SPEED`. A missing joint coasts, and its standard
     deviation grows.
 
     Args:
         acceleration_density: m²/s³, power spectral density of the acceleration.
         measurement_sigma: metres along an axis, standard deviation of a measurement.
-        initial_speed: m/s along an axis, standard deviation of a joint's first velocity.
     """
 
-    def __init__(
-        self, acceleration_density: float, measurement_sigma: float = 0.02, initial_speed: float = 1.0
-    ) -> None:
-        if acceleration_density <= 0 or measurement_sigma <= 0 or initial_speed <= 0:
-            raise ValueError(
-                "Kalman filter: expected an acceleration density, measurement sigma and initial speed above 0, got "
-                f"{acceleration_density}, {measurement_sigma}, {initial_speed}"
-            )
-        self._density, self._sigma, self._initial_speed = acceleration_density, measurement_sigma, initial_speed
+    def __init__(self, acceleration_density: float, measurement_sigma: float = 0.02) -> None:
+        self._density, self._sigma = acceleration_density, measurement_sigma
         self.reset()
 
     def reset(self) -> None:
@@ -70,16 +65,11 @@ class ConstantVelocityFilter:
             self._covariance = np.zeros((3, count))  # variance of position, covariance of both, variance of velocity
             self._known = np.zeros(count, dtype=bool)
         else:
-            if measured.shape != (*self._joints, 3):
-                raise ValueError(f"filter: expected positions of shape {(*self._joints, 3)}, got {measured.shape}")
             if not stamp_s > self._stamp_s:
                 raise ValueError(f"filter: expected a stamp after {self._stamp_s} s, got {stamp_s} s")
             _predict(stamp_s - self._stamp_s, self._density, self._position, self._velocity, self._covariance)
         self._stamp_s = stamp_s
-        speed = self._initial_speed
-        _correct(
-            measured.reshape(-1, 3), self._sigma, speed, self._position, self._velocity, self._covariance, self._known
-        )
+        _correct(measured.reshape(-1, 3), self._sigma, self._position, self._velocity, self._covariance, self._known)
         return self._estimate(stamp_s, self._position.copy(), self._covariance[0])
 
     @property
@@ -129,7 +119,7 @@ def _predict(step, density, position, velocity, covariance):
 
 
 @njit(cache=True)
-def _correct(measured, sigma, initial_speed, position, velocity, covariance, known):
+def _correct(measured, sigma, position, velocity, covariance, known):
     """Update with the measurement (N, 3) of the newest frame."""
     noise = sigma**2
     for joint in range(len(measured)):
@@ -140,7 +130,7 @@ def _correct(measured, sigma, initial_speed, position, velocity, covariance, kno
             for axis in range(3):
                 position[joint, axis] = measured[joint, axis]
                 velocity[joint, axis] = 0.0
-            covariance[0, joint], covariance[1, joint], covariance[2, joint] = noise, 0.0, initial_speed**2
+            covariance[0, joint], covariance[1, joint], covariance[2, joint] = noise, 0.0, INITIAL_SPEED**2
             continue
         own, both = covariance[0, joint], covariance[1, joint]
         gain, velocity_gain = own / (own + noise), both / (own + noise)

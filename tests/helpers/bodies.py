@@ -48,6 +48,11 @@ def waving(frames: int, scale: float = 1.0, speed: float = 1.0) -> np.ndarray:
     return positions - [0.0, 0.0, positions[..., 2].min() - 0.02]
 
 
+def noisy(frames: int, sigma: float, speed: float = 1.0) -> np.ndarray:
+    """The same in white noise of ``sigma`` metres along an axis."""
+    return waving(frames, speed=speed) + np.random.default_rng(0).normal(size=(frames, 22, 3)) * sigma
+
+
 def raw(
     stamp_ns: int,
     bodies: dict[int, np.ndarray],

@@ -1,8 +1,27 @@
-"""The values that steps of the pipeline take, made by hand."""
+"""The values that steps of the pipeline take, made by hand, and what the whole pipeline answers."""
+
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from tests.helpers.bodies import stream
 
+from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw
 from steadypose.prior.clean.frame import Gated, Observation
+from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.settings import PriorSettings
+
+
+def clean(messages: Iterable[PoseRaw], **settings: Any) -> tuple[list[PoseClean], PriorPipeline]:
+    """All answers of the prior with these settings, and the prior."""
+    pipeline = PriorPipeline(PriorSettings.from_dict(settings))
+    cleaned = [answer for message in messages for answer in pipeline.process(message)]
+    return cleaned + pipeline.flush(), pipeline
+
+
+def clean_bodies(positions: np.ndarray, **settings: Any) -> list[CleanBody]:
+    """The answers to one body (T, 22, 3)."""
+    return [answer.bodies[0] for answer in clean(stream(positions), **settings)[0]]
 
 
 def observation(positions: np.ndarray, stamp_s: float = 0.0, confidence: np.ndarray | None = None) -> Observation:

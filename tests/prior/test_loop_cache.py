@@ -79,10 +79,10 @@ def test_a_damaged_entry_is_compiled_anew(folder: Path, damage: Callable[[bytes]
 
 def test_the_doctor_removes_what_is_damaged_and_the_mark_that_all_is_there(folder: Path) -> None:
     njit(cache=True)(add)(1.0)
-    loop_cache.mark_complete(folder, set())
+    damaged = entry(folder)
+    loop_cache.mark_complete(folder, {damaged.name})
     assert loop_cache.is_complete()
     assert loop_cache.remove_damaged() == 0
-    (damaged,) = (file for file in folder.iterdir() if file.name != loop_cache.COMPLETE)
     damaged.write_bytes(b"")
     assert loop_cache.remove_damaged() == 1
     assert not loop_cache.is_complete()
@@ -137,10 +137,8 @@ def test_beside_the_package_first_then_in_the_users_cache(tmp_path: Path, monkey
 
 def test_all_are_there_until_a_source_changes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     njit(cache=True)(add)(1.0)
-    kept = entry(folder)
-    loop_cache.mark_complete(folder, {kept.name})
+    loop_cache.mark_complete(folder, {entry(folder).name})
     assert loop_cache.is_complete()
-    assert kept.exists()
     monkeypatch.setattr(loop_cache, "_sources", lambda: "others")
     assert not loop_cache.is_complete()
 

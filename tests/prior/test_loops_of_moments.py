@@ -15,8 +15,6 @@ from steadypose.prior.clean.history import History
 from steadypose.prior.clean.reconstruct import Denoise
 from steadypose.prior.clean.sensor_error import DepthError
 from steadypose.prior.models import posture
-from steadypose.prior.models.mixture import whiteness
-from steadypose.prior.models.mixture.whiteness import Whiteness
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
@@ -37,36 +35,6 @@ def observed(rng: np.random.Generator, missing: float) -> Floats:
 
 def bones_of(frames: Floats) -> Floats:
     return frames[..., 1:, :] - frames[..., list(PARENTS[1:]), :]
-
-
-@settings(deadline=None, max_examples=20)
-@given(SEEDS, MISSING)
-def test_whiteness_is_the_median_over_bones_of_the_smaller_of_two_ratios(seed: int, missing: float) -> None:
-    frames = observed(np.random.default_rng(seed), missing)
-    found, lengths = Whiteness(SLOTS, 4), np.linalg.norm(bones_of(frames), axis=-1)
-    moved = np.diff(lengths, axis=0, prepend=np.nan)
-    count, pairs, mean, variance, change, undone = np.zeros((6, SLOTS, 21))
-    for t, frame in enumerate(frames):
-        white = found.update(frame)
-        for slot, bone in np.argwhere(np.isfinite(moved[t])):
-            at = slot, bone
-            count[at] += 1
-            share = 1.0 / min(count[at], whiteness.MEMORY)
-            off = lengths[t][at] - mean[at] if count[at] > 1 else 0.0
-            mean[at] = mean[at] + share * off if count[at] > 1 else lengths[t][at]
-            variance[at] = (1 - share) * (variance[at] + share * off**2)
-            change[at] += share * (0.5 * moved[t][at] ** 2 - change[at])
-            if t and np.isfinite(moved[t - 1][at]):
-                pairs[at] += 1
-                undone[at] += (-moved[t][at] * moved[t - 1][at] - undone[at]) / min(pairs[at], whiteness.MEMORY)
-        for slot in range(SLOTS):
-            counts = (count[slot] >= whiteness.LEAST) & (variance[slot] > whiteness.STILL**2) & (change[slot] > 0)
-            own = np.clip(variance[slot] - change[slot], 0.0, whiteness.OWN**2)[counts]
-            neumann = change[slot, counts] / np.maximum(variance[slot, counts] - own, whiteness.STILL**2)
-            ratio = np.minimum(neumann, np.clip(undone[slot, counts] / change[slot, counts], 0.0, 1.0))
-            most = count[slot].max()
-            expected = np.median(ratio) * most / (most + whiteness.START) if len(ratio) else 0.0
-            np.testing.assert_allclose(white[slot], expected, rtol=1e-9)
 
 
 @settings(deadline=None, max_examples=20)

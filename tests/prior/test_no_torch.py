@@ -56,17 +56,3 @@ def test_torch_is_imported_by_fits_and_training_alone() -> None:
     at_the_top = re.compile(r"^(import|from) (torch|roma)", re.M)
     importing = [path.relative_to(PACKAGE) for path in running if at_the_top.search(path.read_text())]
     assert {str(path.parent) for path in importing} == {"prior/fit"}
-
-
-@pytest.mark.parametrize(
-    ("room", "may_not"),
-    [
-        ("msgs", "prior|training|nodes|benchmarks"),
-        ("prior", "training|nodes|benchmarks"),
-        ("training", "nodes|benchmarks"),
-    ],
-)
-def test_no_room_imports_one_that_imports_it(room: str, may_not: str) -> None:
-    upward = re.compile(rf"^\s*(?:from|import) steadypose\.({may_not})\b", re.M)
-    found = {path.name: upward.findall(path.read_text()) for path in (PACKAGE / room).rglob("*.py")}
-    assert {name: rooms for name, rooms in found.items() if rooms} == {}

@@ -1,8 +1,6 @@
 """Live inference of the fault network (`FaultNet`) without torch, its features, and the calibration of its scores.
 
-The fault network gives each joint's log odds of being faulty. A window's score is the highest score of its joints. Both
-are converted to an anomaly: -log10 of the rate at which clean windows of the same pace, of people unseen in training,
-score at least as high. One clean window in a hundred has an anomaly of 2 or more.
+`prior.clean.score` describes the scores and the anomaly.
 """
 
 from __future__ import annotations

@@ -52,8 +52,6 @@ class MixtureSmoother:
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
         """``weights`` is a weight set or a path, as in `load_weights`."""
-        if delay < 0:
-            raise ValueError(f"mixture: expected a delay of 0 frames or more, got {delay}")
         self.delay = delay
         self._slots = slots
         self._net = _network(weights)
@@ -151,17 +149,13 @@ class _Network(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """Recurrent state of S bodies.
+    """Recurrent state of S bodies: sums of `Memory` and their weights, and the last outputs."""
 
-    It holds sums of `Memory` and their weights, of joints' features (S, 22, own) and of bodies' features (S, body), and
-    the last outputs (S, 22, OUTPUTS).
-    """
-
-    own: Floats
+    own: Floats  # (S, 22, own)
     own_weight: Floats
-    body: Floats
+    body: Floats  # (S, body)
     body_weight: Floats
-    written: Floats
+    written: Floats  # (S, 22, OUTPUTS)
 
 
 @cache

@@ -13,7 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENT
+from steadypose.prior.body.vectors import apart
 from steadypose.prior.compiled import median, njit
 
 MEMORY, LEAST = 45, 5
@@ -39,7 +40,7 @@ second without delay. The limit is 1 in much smaller noise and 0.5 in much large
 STILL = 1e-3
 """Least standard deviation of a bone's length for its whiteness to count, metres."""
 
-_PARENTS = np.array(PARENTS[1:])
+_BONES = len(PARENT) - 1
 
 
 class Whiteness:
@@ -57,9 +58,9 @@ class Whiteness:
 
     def __init__(self, slots: int, delay: int) -> None:
         self._start = START if delay else START_NEWEST
-        self._last, self._step = np.full((2, slots, len(_PARENTS)), np.nan)
-        self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, len(_PARENTS)))
-        self._pairs, self._undone = np.zeros((2, slots, len(_PARENTS)))
+        self._last, self._step = np.full((2, slots, _BONES), np.nan)
+        self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, _BONES))
+        self._pairs, self._undone = np.zeros((2, slots, _BONES))
 
     def forget(self, slot: NDArray[np.bool_]) -> None:
         """Forget the bodies in these slots (S,)."""
@@ -85,14 +86,11 @@ class Whiteness:
 @njit(cache=True)
 def _update(positions, last, step, frames, mean, variance, change, pairs, undone, white):
     """Add joints (S, 22, 3) to the moments of `Whiteness`, and write the median ``white`` (S,) of the bones' ratios."""
-    ratios = np.empty(len(_PARENTS))
+    ratios = np.empty(_BONES)
     for slot in range(len(positions)):
         count = 0
-        for k in range(len(_PARENTS)):
-            square = 0.0
-            for axis in range(3):
-                square += (positions[slot, k + 1, axis] - positions[slot, _PARENTS[k], axis]) ** 2
-            length = math.sqrt(square)
+        for k in range(_BONES):
+            length = apart(positions[slot], k + 1, PARENT[k + 1])
             moved = length - last[slot, k]
             changed, back = 0.5 * moved * moved, -moved * step[slot, k]
             last[slot, k], step[slot, k] = length, moved

@@ -95,60 +95,63 @@ def forget(past: Past, slot: NDArray[np.bool_]) -> None:
 
 
 @njit(cache=True)
-def observe(past, slot, positions, sigma, unseen_s, held):
-    """Update the state with a body's frame, and write its pose with occluded joints held in the body frame.
+def observe(past, slots, positions, sigma, unseen_s, held):
+    """Update the state with a frame of B bodies, and write their poses with occluded joints held in the body frame.
 
     Args:
         past: a `Past`.
-        slot: slot of the body.
-        positions: (22, 3) metres, from the smoother; NaN for joints never observed.
-        sigma: (22,) metres along an axis, their standard deviations.
-        unseen_s: (22,) seconds since each joint was last observed; 0 for an observed joint.
-        held: (22, 3) metres, written; NaN for joints never observed.
+        slots: (B,) slots of the bodies.
+        positions: (B, 22, 3) metres, from the smoother; NaN for joints never observed.
+        sigma: (B, 22) metres along an axis, their standard deviations.
+        unseen_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
+        held: (B, 22, 3) metres, written; NaN for joints never observed.
     """
-    poses, joints = past.poses[slot], len(positions)
+    joints = positions.shape[1]
     seen = np.empty(joints, dtype=np.bool_)
-    for joint in range(joints):
-        seen[joint] = unseen_s[joint] == 0.0 and math.isfinite(positions[joint, 0] + sigma[joint])
-        moved = 0.0
-        for axis in range(3):
-            moved += (positions[joint, axis] - past.place[slot, joint, axis]) ** 2
-            past.place[slot, joint, axis] = held[joint, axis] = positions[joint, axis]
-        moved = math.sqrt(moved) * FPS if math.isfinite(moved) else 0.0
-        past.speed[slot, joint] += FADING * (moved - past.speed[slot, joint])
-        if seen[joint]:
-            past.speed_seen[slot, joint] = past.speed[slot, joint]
-    for joint in range(joints):
-        if not seen[joint]:
-            _hold(joint, poses[joint], positions, seen, held)
-    for joint in range(joints):
-        if seen[joint]:
-            for other in range(joints):
-                for axis in range(3):
-                    poses[joint, other, axis] = held[other, axis]
+    for row, slot in enumerate(slots):
+        for joint in range(joints):
+            seen[joint] = unseen_s[row, joint] == 0.0 and math.isfinite(positions[row, joint, 0] + sigma[row, joint])
+            moved = 0.0
+            for axis in range(3):
+                moved += (positions[row, joint, axis] - past.place[slot, joint, axis]) ** 2
+                past.place[slot, joint, axis] = held[row, joint, axis] = positions[row, joint, axis]
+            moved = math.sqrt(moved) * FPS if math.isfinite(moved) else 0.0
+            past.speed[slot, joint] += FADING * (moved - past.speed[slot, joint])
+            if seen[joint]:
+                past.speed_seen[slot, joint] = past.speed[slot, joint]
+        for joint in range(joints):
+            if not seen[joint]:
+                _hold(joint, past.poses[slot, joint], positions[row], seen, held[row])
+        _keep(past.poses[slot], seen, held[row])
 
 
 @njit(cache=True)
-def average(past, slot, never, completed, held):
+def average(past, slots, never, completed, held):
     """Update the running mean of the completed positions of joints that were never observed, relative to the others.
 
     Args:
         past: a `Past`, in which the poses of these joints are those of the frame before.
-        slot: slot of the body.
-        never: (22,) which joints were never observed.
-        completed: (22, 3) metres, the completion.
-        held: (22, 3) metres, written by `observe`; for these joints, overwritten by the mean.
+        slots: (B,) slots of the bodies.
+        never: (B, 22) which joints were never observed.
+        completed: (B, 22, 3) metres, the completion.
+        held: (B, 22, 3) metres, written by `observe`; for these joints, overwritten by the mean.
     """
-    poses, joints = past.poses[slot], len(never)
-    for joint in range(joints):
-        if never[joint]:
-            for axis in range(3):
-                before = held[joint, axis]
-                step = completed[joint, axis] - before
-                held[joint, axis] = before + AVERAGING * step if math.isfinite(step) else completed[joint, axis]
-    for joint in range(joints):
-        if never[joint]:
-            for other in range(joints):
+    for row, slot in enumerate(slots):
+        for joint in range(never.shape[1]):
+            if never[row, joint]:
+                for axis in range(3):
+                    before, now = held[row, joint, axis], completed[row, joint, axis]
+                    step = now - before
+                    held[row, joint, axis] = before + AVERAGING * step if math.isfinite(step) else now
+        _keep(past.poses[slot], never[row], held[row])
+
+
+@njit(cache=True)
+def _keep(poses, which, held):
+    """Keep the pose ``held`` (22, 3) as the last one of these joints (22,)."""
+    for joint in range(len(which)):
+        if which[joint]:
+            for other in range(len(which)):
                 for axis in range(3):
                     poses[joint, other, axis] = held[other, axis]
 
@@ -158,20 +161,21 @@ def stand(never, positions, unseen_s, placed):
     """Move joints that were never observed towards their positions in a standing adult, in place.
 
     Args:
-        never: (22,) which joints were never observed.
-        positions: (22, 3) metres, from the smoother.
-        unseen_s: (22,) seconds since each joint was last observed; 0 for an observed joint.
-        placed: (22, 3) metres, mean completed positions of these joints, changed; other joints do not change.
+        never: (B, 22) which joints were never observed.
+        positions: (B, 22, 3) metres, from the smoother.
+        unseen_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
+        placed: (B, 22, 3) metres, mean completed positions of these joints, changed; other joints do not change.
     """
-    seen, standing = np.empty(len(never), dtype=np.bool_), np.empty((len(never), 3))
-    for joint in range(len(never)):
-        seen[joint] = unseen_s[joint] == 0.0 and math.isfinite(positions[joint, 0])
-    if seen.any():
-        for joint in range(len(never)):
-            if never[joint]:
-                _hold(joint, STANDING, positions, seen, standing)
+    joints = never.shape[1]
+    seen, standing = np.empty(joints, dtype=np.bool_), np.empty((joints, 3))
+    for row in range(len(never)):
+        for joint in range(joints):
+            seen[joint] = unseen_s[row, joint] == 0.0 and math.isfinite(positions[row, joint, 0])
+        for joint in range(joints):
+            if never[row, joint] and seen.any():
+                _hold(joint, STANDING, positions[row], seen, standing)
                 for axis in range(3):
-                    placed[joint, axis] += STANDING_SHARE * (standing[joint, axis] - placed[joint, axis])
+                    placed[row, joint, axis] += STANDING_SHARE * (standing[joint, axis] - placed[row, joint, axis])
 
 
 @njit(cache=True)

@@ -4,6 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk
 
+from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import (
     CONTACT_JOINTS,
     LOAD_SPEED,
@@ -39,6 +40,8 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
     assert all(np.allclose(ours, theirs) for ours, theirs in zip((got, orientations), in_torch, strict=True))
     for index in np.ndindex(2, 3):
         assert np.allclose(got[index], naive_fk(rotations[index], offsets[index], root[index]))
+    offsets[..., 0, :] = 0.0
+    assert np.allclose(place_joints(rotations, offsets), got - root[..., None, :])
 
 
 def test_forward_kinematics_is_differentiable() -> None:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk, random_pose
@@ -8,24 +8,14 @@ from tests.helpers.bodies import fk, random_pose
 from steadypose.prior.body.inverse_kinematics import (
     RIGID,
     fit_lengths,
-    place_joints,
     solve_pose,
     solve_rotations,
     write_swing,
 )
-from steadypose.prior.body.kinematics import forward_kinematics, heading, yaw_matrix
+from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, REST_OFFSETS, J
 
 UNITS = st.floats(-1, 1, allow_nan=False)
-
-
-def test_placing_agrees_with_the_forward_kinematics_of_the_losses() -> None:
-    rng = np.random.default_rng(0)
-    rotations = Rotation.random(6 * 22, rng=rng).as_matrix().reshape(2, 3, 22, 3, 3)
-    offsets = rng.normal(size=(2, 3, 22, 3))
-    offsets[..., 0, :] = 0.0
-    expected = forward_kinematics(rotations, offsets, np.zeros(3))[0]
-    assert np.allclose(place_joints(rotations, offsets), expected)
 
 
 def test_solving_then_placing_gives_the_positions_back() -> None:
@@ -67,6 +57,9 @@ def test_turning_the_world_turns_only_the_root(angle: float, shift: tuple[float,
 
 
 @given(st.tuples(UNITS, UNITS, UNITS), st.tuples(UNITS, UNITS, UNITS))
+@example((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+@example((0.0, 0.5, 0.0), (0.0, -1.0, 0.0))
+@example((0.0, 0.0, -1.0), (0.0, 0.0, 1.0))
 @settings(max_examples=200)
 def test_swing_turns_one_direction_into_the_other(a: tuple[float, ...], b: tuple[float, ...]) -> None:
     a_, b_ = np.array(a), np.array(b)
@@ -77,14 +70,6 @@ def test_swing_turns_one_direction_into_the_other(a: tuple[float, ...], b: tuple
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-6)
     assert np.allclose(rotation @ a_ / np.linalg.norm(a_), b_ / np.linalg.norm(b_), atol=1e-3)
-
-
-def test_swing_of_opposite_directions_is_a_half_turn() -> None:
-    for axis in np.eye(3):
-        rotation = np.empty((3, 3))
-        write_swing(axis, -axis, rotation)
-        assert np.allclose(rotation @ axis, -axis)
-        assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
 def test_missing_joints_keep_the_fallback_and_the_rest_is_solved() -> None:

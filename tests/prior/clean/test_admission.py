@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.helpers.bodies import raw, stream, waving
+from tests.helpers.values import clean
 
-from steadypose.msgs.types import PoseClean, PoseRaw
+from steadypose.msgs.types import PoseRaw
 from steadypose.prior.clean.admission import LASTING, StampGate
 from steadypose.prior.clean.batch import StreamBatch
-from steadypose.prior.clean.pipeline import BACKWARDS_NS, PriorPipeline
+from steadypose.prior.clean.pipeline import BACKWARDS_NS
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
 YEAR_2037_NS = 2_114_380_800 * SECOND_NS
-SIMPLE = {stage: {"enabled": False} for stage in ("score", "impute")} | {"max_bodies": 2}
-
-
-def answers(messages: list[PoseRaw]) -> tuple[list[PoseClean], Counter[str]]:
-    prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
-    return [clean for message in messages for clean in prior.process(message)] + prior.flush(), prior.counters
+SIMPLE: dict[str, Any] = {stage: {"enabled": False} for stage in ("score", "impute")} | {"max_bodies": 2}
 
 
 @pytest.fixture(scope="module")
@@ -37,28 +34,28 @@ def frames() -> list[PoseRaw]:
 @pytest.mark.parametrize("wrong_ns", [0, 10, START_NS + 5 * SECOND_NS, START_NS - 5 * SECOND_NS, YEAR_2037_NS])
 def test_one_wrong_stamp_changes_nothing_but_a_count(frames: list[PoseRaw], wrong_ns: int) -> None:
     wrong = dataclasses.replace(frames[20], stamp_ns=wrong_ns)
-    expected, _ = answers(frames)
-    found, counters = answers([*frames[:20], wrong, *frames[20:]])
+    expected, _ = clean(frames, **SIMPLE)
+    found, prior = clean([*frames[:20], wrong, *frames[20:]], **SIMPLE)
     assert found == expected
-    assert counters == {"stamp_outlier": 1}
+    assert prior.counters == {"stamp_outlier": 1}
 
 
 @pytest.mark.parametrize("shift_ns", [3 * SECOND_NS, -3 * SECOND_NS, YEAR_2037_NS - START_NS])
 def test_a_clock_that_was_set_loses_no_frame(frames: list[PoseRaw], shift_ns: int) -> None:
     later = [dataclasses.replace(frame, stamp_ns=frame.stamp_ns + shift_ns) for frame in frames[20:]]
-    found, counters = answers([*frames[:20], *later])
-    assert [clean.stamp_ns for clean in found] == [frame.stamp_ns for frame in [*frames[:20], *later]]
-    assert all(clean.bodies for clean in found)
-    assert not counters["stamp_outlier"]
+    found, prior = clean([*frames[:20], *later], **SIMPLE)
+    assert [answer.stamp_ns for answer in found] == [frame.stamp_ns for frame in [*frames[:20], *later]]
+    assert all(answer.bodies for answer in found)
+    assert not prior.counters["stamp_outlier"]
 
 
 def test_a_stream_that_ends_within_the_jump_is_answered(frames: list[PoseRaw]) -> None:
     late = [
         dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS) for frame in frames[20 : 20 + LASTING - 1]
     ]
-    assert len(answers([*frames[:20], *late])[0]) == 20 + LASTING - 1
+    assert len(clean([*frames[:20], *late], **SIMPLE)[0]) == 20 + LASTING - 1
     end = dataclasses.replace(late[-1], bodies=[], end_of_stream=True)
-    found, _ = answers([*frames[:20], *late, end])
+    found, _ = clean([*frames[:20], *late, end], **SIMPLE)
     assert len(found) == 20 + LASTING
     assert found[-1].end_of_stream
 
@@ -74,7 +71,7 @@ def test_a_server_drops_a_wrong_stamp_of_one_stream_alone(frames: list[PoseRaw])
                 found += server.process_at(dataclasses.replace(message, stamp_ns=YEAR_2037_NS), now_ns)
             found += server.process_at(message, now_ns)
     for source in ("door", "desk"):
-        stamps = [clean.stamp_ns for clean in found if clean.source == source]
+        stamps = [answer.stamp_ns for answer in found if answer.source == source]
         assert np.diff(stamps) == pytest.approx(PERIOD_NS, abs=2)
     assert +server.counters == {"stamp_outlier": 1}
 

@@ -4,7 +4,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tests.helpers.bodies import stream, waving
+from tests.helpers.bodies import waving
+from tests.helpers.values import clean_bodies
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.clean.pipeline import PriorPipeline
@@ -30,11 +31,6 @@ from steadypose.training.networks.graph import FaultNet, load_fault_net
 
 HEIGHTS = np.linspace(0.0, 7.0, len(RATES))
 SCALE = Calibration(np.broadcast_to(HEIGHTS, (len(MISSING), len(SENSOR_SIGMAS), len(PACES), len(RATES))))
-
-
-def scored(positions: np.ndarray, **settings) -> list:
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, **settings}))
-    return [c.bodies[0] for m in stream(positions) for c in pipeline.process(m)]
 
 
 def looks(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -113,16 +109,16 @@ def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeat
     frozen = moving.copy()
     frozen[60:, J["left_wrist"]] = moving[59, J["left_wrist"]]
     gate_off = {"gate": {"enabled": False}, "person": {"enabled": False}}
-    clean, spoilt = scored(moving, **gate_off)[-1], scored(frozen, **gate_off)[-1]
+    clean, spoilt = clean_bodies(moving, delay=0, **gate_off)[-1], clean_bodies(frozen, delay=0, **gate_off)[-1]
     assert spoilt.anomaly > clean.anomaly + 1
     assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
 
 
 def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:
     clean = waving(90)
-    bodies = scored(clean)
+    bodies = clean_bodies(clean, delay=0)
     assert not any(b.anomaly_flag for b in bodies)
-    assert [b.anomaly for b in bodies] == [b.anomaly for b in scored(clean)]
+    assert [b.anomaly for b in bodies] == [b.anomaly for b in clean_bodies(clean, delay=0)]
 
 
 def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> None:
@@ -130,7 +126,7 @@ def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> 
     spoilt = waving(200)
     arms = [J[f"{side}_{n}"] for n in ("elbow", "wrist") for side in ("left", "right")]
     spoilt[60:100, arms] = spoilt[60:100][:, MIRROR[arms]]
-    bodies = scored(spoilt, gate={"enabled": False}, person={"enabled": False})
+    bodies = clean_bodies(spoilt, delay=0, gate={"enabled": False}, person={"enabled": False})
     flags = np.array([b.anomaly_flag for b in bodies])
     assert not flags[:60].any()
     assert flags[60:90].any()
@@ -172,7 +168,7 @@ def test_what_a_body_scores_all_the_time_is_no_fault_and_a_fault_of_a_second_no_
 
 
 def test_switched_off_nothing_is_scored() -> None:
-    bodies = scored(waving(30), score={"enabled": False})
+    bodies = clean_bodies(waving(30), delay=0, score={"enabled": False})
     assert np.isnan([b.anomaly for b in bodies]).all()
     assert not any(b.anomaly_flag for b in bodies)
 

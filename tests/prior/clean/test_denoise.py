@@ -1,20 +1,16 @@
 import numpy as np
 import pytest
-from tests.helpers.bodies import stream, waving
-from tests.helpers.values import gated
+from tests.helpers.bodies import waving
+from tests.helpers.values import clean_bodies, gated
 
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.history import History
-from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
-from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.kalman import Smoothed
 
 
 def answers(seen: np.ndarray, delay: int = 4, **settings) -> np.ndarray:
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": delay, "bias_sigma": 0.002, **settings}))
-    messages = [c for m in stream(seen) for c in pipeline.process(m)] + pipeline.flush()
-    return np.stack([m.bodies[0].positions for m in messages])
+    return np.stack([body.positions for body in clean_bodies(seen, delay=delay, bias_sigma=0.002, **settings)])
 
 
 def error_mm(found: np.ndarray, truth: np.ndarray) -> float:

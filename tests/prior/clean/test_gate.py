@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.helpers.bodies import waving
+from tests.helpers.bodies import noisy, waving
 from tests.helpers.values import observation
 
 from steadypose.prior.body.skeleton import MIRROR, J
@@ -21,19 +21,15 @@ def run(positions: np.ndarray, **settings) -> tuple[np.ndarray, Counter[str]]:
     return np.array(passed), counters
 
 
-def noisy(frames: int = 90) -> np.ndarray:
-    return waving(frames) + np.random.default_rng(0).normal(size=(frames, 22, 3)) * 0.01
-
-
 def test_ordinary_motion_with_ordinary_noise_passes_untouched() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     passed, counters = run(positions)
     assert np.array_equal(passed, positions)
     assert not counters
 
 
 def test_a_spike_becomes_unobserved_and_the_next_frame_passes() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     positions[50, WRIST] += [0.3, 0, 0]
     passed, counters = run(positions)
     assert np.isnan(passed[50, WRIST]).all()
@@ -66,7 +62,7 @@ def test_of_a_sensor_whose_bones_vary_their_lengths_excuse_nothing() -> None:
 
 
 def test_a_joint_that_stays_where_it_jumped_is_believed_before_long() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     positions[40:, WRIST] += [0.0, 0.0, 0.4]
     passed, _ = run(positions)
     refused = np.isnan(passed[:, WRIST, 0])
@@ -99,7 +95,7 @@ def test_exchanged_legs_are_put_back() -> None:
 
 
 def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     arms = [J[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist") for side in ("left", "right")]
     spoilt = positions.copy()
     spoilt[50:53, arms] = positions[50:53][:, MIRROR[arms]]
@@ -109,7 +105,7 @@ def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
 
 
 def test_a_whole_body_that_jumps_is_another_matter_than_its_joints() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     positions[50:] += [1.0, 0, 0]
     passed, counters = run(positions)
     assert np.array_equal(passed, positions)
@@ -126,7 +122,7 @@ def test_low_confidence_is_not_seen() -> None:
 
 
 def test_switched_off_everything_passes() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     positions[50, WRIST] += [0.5, 0, 0]
     passed, counters = run(positions, enabled=False)
     assert np.array_equal(passed, positions)
@@ -134,7 +130,7 @@ def test_switched_off_everything_passes() -> None:
 
 
 def test_a_joint_that_is_frozen_becomes_unobserved() -> None:
-    positions = noisy()
+    positions = noisy(90, 0.01)
     positions[40:70, WRIST] = positions[39, WRIST]
     passed, counters = run(positions)
     assert np.isnan(passed[47:70, WRIST]).all()

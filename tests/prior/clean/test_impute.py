@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 from tests.helpers.bodies import stream, waving
+from tests.helpers.values import clean, clean_bodies
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
-from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 
 ARM = [J["left_elbow"], J["left_wrist"]]
@@ -15,16 +15,6 @@ def hidden_arm(frames: int = 90, start: int = 50) -> np.ndarray:
     seen = waving(frames)
     seen[start:, ARM] = np.nan
     return seen
-
-
-def answers(seen: np.ndarray, **settings) -> tuple[list, PriorPipeline]:
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0, **settings}))
-    return [c.bodies[0] for m in stream(seen) for c in pipeline.process(m)], pipeline
-
-
-def error(bodies: list, frames: slice) -> float:
-    found = np.array([b.positions for b in bodies])
-    return float(np.linalg.norm(found - waving(len(bodies)), axis=-1)[frames][:, ARM].mean())
 
 
 def test_what_the_model_was_off_is_carried_into_a_gap_from_both_sides_and_fades() -> None:
@@ -49,30 +39,32 @@ def test_beside_a_gap_the_mean_of_some_frames_is_carried_and_none_beyond_the_nex
 
 
 def test_a_hidden_arm_is_imputed_better_than_held_and_marked() -> None:
-    bodies, _ = answers(hidden_arm())
-    held = np.linalg.norm(waving(90)[51:65][:, ARM] - waving(90)[49][ARM], axis=-1).mean()
-    assert error(bodies, slice(51, 65)) < held
+    bodies, truth = clean_bodies(hidden_arm(), delay=0), waving(90)[:, ARM]
+    held = np.linalg.norm(truth[51:65] - truth[49], axis=-1).mean()
+    found = np.array([b.positions[ARM] for b in bodies])
+    assert np.linalg.norm(found - truth, axis=-1)[51:65].mean() < held
+    assert (bodies[45].state == JointState.REFINED).all()
+    assert (bodies[60].sigma[ARM] > 1.1 * bodies[45].sigma[ARM]).all()
     assert all((b.state[ARM] == JointState.IMPUTED).all() for b in bodies[50:])
     assert all(np.isnan(b.raw_positions[ARM]).all() for b in bodies[50:])
 
 
 def test_other_bodies_do_not_change_what_is_imputed() -> None:
-    alone, _ = answers(hidden_arm(70))
+    alone = clean_bodies(hidden_arm(70), delay=0)
     messages = stream(hidden_arm(70))
     for message, other in zip(messages, stream(waving(70) + [2.0, 0.0, 0.0]), strict=True):
         body = other.bodies[0]
         body.id = 5
         body.positions[ARM] = np.nan
         message.bodies.append(body)
-    pipeline = PriorPipeline(PriorSettings.from_dict({"delay": 0}))
-    beside = [c.bodies[0] for m in messages for c in pipeline.process(m)]
+    beside = [c.bodies[0] for c in clean(messages, delay=0)[0]]
     assert all(np.allclose(a.positions, b.positions, atol=1e-6) for a, b in zip(alone, beside, strict=True))
 
 
 def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
     refined = {"impute": {"enabled": False}, "refine": {"enabled": True}}
-    off, _ = answers(hidden_arm(65), **refined, score={"enabled": False})
-    scored, _ = answers(hidden_arm(65), **refined)
+    off = clean_bodies(hidden_arm(65), delay=0, **refined, score={"enabled": False})
+    scored = clean_bodies(hidden_arm(65), delay=0, **refined)
     assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
     assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[50:])
 

@@ -1,6 +1,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tests.helpers.bodies import stream, waving
+from tests.helpers.bodies import noisy, stream, waving
+from tests.helpers.values import clean_bodies
 
 from steadypose.msgs.types import CleanBody
 from steadypose.prior.body.inverse_kinematics import solve_rotations
@@ -13,9 +14,7 @@ FRAMES, SETTLED = 60, 20
 
 
 def _bodies(positions: np.ndarray, orient: bool) -> list[CleanBody]:
-    pipeline = PriorPipeline(PriorSettings.from_dict({"orient": {"enabled": orient}}))
-    answers = [c for message in stream(positions) for c in pipeline.process(message)] + pipeline.flush()
-    return [c.bodies[0] for c in answers]
+    return clean_bodies(positions, orient={"enabled": orient})
 
 
 def _root(bodies: list[CleanBody]) -> Rotation:
@@ -23,8 +22,7 @@ def _root(bodies: list[CleanBody]) -> Rotation:
 
 
 def test_positions_are_those_without_it_byte_for_byte() -> None:
-    noisy = waving(FRAMES) + np.random.default_rng(0).normal(0.0, 0.02, (FRAMES, 22, 3))
-    mine, plain = _bodies(noisy, True), _bodies(noisy, False)
+    mine, plain = (_bodies(noisy(FRAMES, 0.02), on) for on in (True, False))
     for name in ("positions", "sigma", "state", "bone_lengths"):
         np.testing.assert_array_equal([getattr(b, name) for b in mine], [getattr(b, name) for b in plain])
     assert mine[-1].rotations.tobytes() != plain[-1].rotations.tobytes()
@@ -61,8 +59,7 @@ def test_with_noise_the_root_is_nearer_the_true_one_and_turns_less() -> None:
 
 
 def test_a_body_begins_anew_without_the_twist_of_the_one_before() -> None:
-    noisy = waving(FRAMES) + np.random.default_rng(0).normal(0.0, 0.02, (FRAMES, 22, 3))
-    pipeline = PriorPipeline(PriorSettings())
-    runs = [[c for m in stream(noisy) for c in pipeline.process(m)] + pipeline.flush() for _ in range(2)]
+    pipeline, messages = PriorPipeline(PriorSettings()), stream(noisy(FRAMES, 0.02))
+    runs = [[c for m in messages for c in pipeline.process(m)] + pipeline.flush() for _ in range(2)]
     for first, second in zip(*runs, strict=True):
         np.testing.assert_array_equal(first.bodies[0].rotations, second.bodies[0].rotations)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from tests.helpers.bodies import waving
+from tests.helpers.bodies import noisy, waving
 
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.outliers import RECENT, BoneOutliers, frozen_joints
@@ -15,18 +15,14 @@ def judged(positions: np.ndarray) -> np.ndarray:
     return np.array([outliers.update(frame[None])[0] for frame in positions])
 
 
-def noisy(frames: int = 150, sigma: float = 0.005, speed: float = 1.0) -> np.ndarray:
-    return waving(frames, speed=speed) + np.random.default_rng(0).normal(scale=sigma, size=(frames, 22, 3))
-
-
 @pytest.mark.parametrize("sigma", [0.0, 0.01, 0.04, 0.1])
 @pytest.mark.parametrize("speed", [0.0, 1.0, 4.0])
 def test_bones_as_long_as_ever_are_not_judged_whatever_the_noise_and_the_motion(sigma: float, speed: float) -> None:
-    assert not judged(noisy(sigma=sigma, speed=speed)).any()
+    assert not judged(noisy(150, sigma, speed)).any()
 
 
 def test_a_wrist_that_collapses_onto_the_elbow_is_found_at_once_and_alone() -> None:
-    positions = noisy()
+    positions = noisy(150, 0.005)
     positions[60:80, WRIST] = positions[60:80, ELBOW] + 0.02
     found = judged(positions)
     assert found[60:80, WRIST].all()
@@ -34,25 +30,25 @@ def test_a_wrist_that_collapses_onto_the_elbow_is_found_at_once_and_alone() -> N
 
 
 def test_what_hangs_from_a_joint_thrown_aside_goes_with_it() -> None:
-    positions = noisy()
+    positions = noisy(150, 0.005)
     positions[60, LEG] += [0.0, 0.5, 0.0]
     assert set(np.flatnonzero(judged(positions)[60])) == set(LEG)
 
 
 def test_of_two_bad_bones_the_joint_between_is_wrong() -> None:
-    positions = noisy()
+    positions = noisy(150, 0.005)
     positions[60, ELBOW] += [0.0, 0.5, 0.0]
     assert list(np.flatnonzero(judged(positions)[60])) == [ELBOW]
 
 
 def test_when_most_bones_change_it_is_another_body() -> None:
-    positions = noisy()
+    positions = noisy(150, 0.005)
     positions[60:] = 2.0 * positions[60:]
     assert not judged(positions).any()
 
 
 def test_a_bone_that_stays_as_it_is_is_believed_within_two_seconds() -> None:
-    positions = noisy(200)
+    positions = noisy(200, 0.005)
     positions[60:, WRIST] = positions[60:, ELBOW] + 0.02
     found = judged(positions)[:, WRIST]
     assert found[60:70].all()
@@ -60,7 +56,7 @@ def test_a_bone_that_stays_as_it_is_is_believed_within_two_seconds() -> None:
 
 
 def test_joints_unseen_and_bodies_forgotten_are_not_judged() -> None:
-    positions = noisy(60)
+    positions = noisy(60, 0.005)
     positions[30:40, ELBOW] = np.nan
     outliers = BoneOutliers(2)
     for frame in positions:

@@ -68,8 +68,6 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
     seen, known_sigma = noisy(walk(40)), MEASUREMENT_SIGMA / 0.8
     bank, confidence = new_bank(1, delay), np.full((1, 22), 0.8)
     textbook = [ConstantVelocityFilter(density, known_sigma) for density in DENSITIES]
-    experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
-    gap, between = np.empty((2, 1, 22))
     misfit, spread, count = (np.zeros((22, len(DENSITIES))) for _ in range(3))
     for t, frame in enumerate(seen):
         advance(bank, t, 1 / FPS, frame, confidence, DENSITIES, MEASUREMENT_SIGMA, np.eye(22))
@@ -85,15 +83,15 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
             smoother.update(frame, t / FPS)
         if t < max(delay, 1):
             continue
-        describe(bank, t + 1, delay, PARENT, np.array([white]), experts, features, scale, gap, between)
+        experts, _ = described(bank, t + 1, delay, white)
         so_far = seen[: t + 1, 0], np.arange(t + 1) / FPS, delay, 2
         each = np.stack([fixed_lag(*so_far, density, known_sigma)[t - delay] for density in DENSITIES], axis=1)
-        np.testing.assert_allclose(experts[0, :, : len(DENSITIES)], each, atol=1e-6)
+        np.testing.assert_allclose(experts[:, : len(DENSITIES)], each, atol=1e-6)
         noise = (likely(count, misfit, spread) * misfit / count).sum(axis=1)
         shared = SHARED * white
         weights = likely(count + shared, misfit + shared * np.exp(np.log(noise).mean()), spread)
         mean = (weights[..., None] * each).sum(axis=1)
-        np.testing.assert_allclose(experts[0, :, MULTIPLE_MODEL], mean, atol=1e-6)
+        np.testing.assert_allclose(experts[:, MULTIPLE_MODEL], mean, atol=1e-6)
 
 
 def likely(count: Floats, misfit: Floats, spread: Floats) -> Floats:
@@ -103,16 +101,24 @@ def likely(count: Floats, misfit: Floats, spread: Floats) -> Floats:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def multiple_model(seen: Floats, covariance: Floats, delay: int = 4) -> tuple[Floats, Bank]:
-    """The multiple-model estimate (T - delay, 22, 3) of a body (T, 22, 3), and the bank at the end."""
-    bank, (gap, between), found = new_bank(1, delay), np.empty((2, 1, 22)), []
+def described(bank: Bank, count: int, delay: int, white: float = 0.0) -> tuple[Floats, Floats]:
+    """Experts (22, EXPERTS, 3) and gaps (22,) of a bank's only body."""
     experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
+    gap, between = np.empty((2, 1, 22))
+    describe(bank, count, delay, PARENT, np.array([white]), experts, features, scale, gap, between)
+    return experts[0], gap[0]
+
+
+def multiple_model(seen: Floats, covariance: Floats, delay: int = 4) -> tuple[Floats, Floats, Bank]:
+    """Of a body (T, 22, 3): multiple-model estimates (T - delay, 22, 3), gaps (T - delay, 22), the bank at the end."""
+    bank, found = new_bank(1, delay), []
     for t, frame in enumerate(seen[:, None]):
         advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA, covariance)
         if t >= delay:
-            describe(bank, t + 1, delay, PARENT, np.zeros(1), experts, features, scale, gap, between)
-            found.append(experts[0, :, MULTIPLE_MODEL].copy())
-    return np.array(found), bank
+            experts, gap = described(bank, t + 1, delay)
+            found.append((experts[:, MULTIPLE_MODEL], gap))
+    estimates, gaps = zip(*found, strict=True)
+    return np.array(estimates), np.array(gaps), bank
 
 
 @pytest.mark.parametrize("hidden", [False, True])
@@ -131,26 +137,20 @@ def test_a_body_is_smoothed_better_than_its_joints(hidden: bool) -> None:
 def test_a_joint_that_is_missed_for_long_is_a_track_by_itself_until_it_has_settled() -> None:
     seen = noisy(walk(60))[:, 0]
     seen[30:40, 7] = np.nan
-    belongs = [bool(multiple_model(seen[:t], body_covariance(), 0)[1].member[0, 7]) for t in range(20, 60)]
+    belongs = [bool(multiple_model(seen[:t], body_covariance(), 0)[2].member[0, 7]) for t in range(20, 60)]
     assert belongs == [not 30 + HELD < t <= 40 + SETTLED for t in range(20, 60)]
-    bank = multiple_model(seen[:37], body_covariance(), 0)[1]
+    bank = multiple_model(seen[:37], body_covariance(), 0)[2]
     np.testing.assert_allclose(bank.modes[0] @ bank.modes[0].T, np.eye(22), atol=1e-12)
     assert np.flatnonzero(bank.modes[0, 7]).tolist() == [7]
 
 
 def test_the_gap_is_the_time_to_the_nearest_sighting() -> None:
-    seen = walk(12)
-    seen[:3, :, 5] = np.nan
-    seen[6:9, :, 5] = np.nan
-    bank, (gap, between), found = new_bank(1, 4), np.empty((2, 1, 22)), []
-    experts, features, scale = np.empty((1, 22, EXPERTS, 3)), np.empty((1, 22, FEATURES), np.float32), np.empty(1)
-    for t, frame in enumerate(seen):
-        advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA, body_covariance())
-        if t >= 4:
-            describe(bank, t + 1, 4, PARENT, np.zeros(1), experts, features, scale, gap, between)
-            found.append(int(gap[0, 5]))
-    assert found == [-1, -1, -1, 0, 0, 0, 1, 2]
-    assert (np.delete(gap, 5) == 0).all()
+    seen = walk(12)[:, 0]
+    seen[:3, 5] = np.nan
+    seen[6:9, 5] = np.nan
+    gaps = multiple_model(seen, body_covariance())[1]
+    assert gaps[:, 5].tolist() == [-1, -1, -1, 0, 0, 0, 1, 2]
+    assert (np.delete(gaps, 5, axis=1) == 0).all()
 
 
 def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:

@@ -14,14 +14,14 @@ from steadypose.benchmarks.baselines.body import beside, facing
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENT, J
-from steadypose.prior.clean.occluded import DENSITIES, FIRST_SPEED, OccludedJoints, Track, bridge
+from steadypose.prior.clean.occluded import DENSITIES, FIRST_SPEED, OccludedJoints, Placed, Track, bridge
 from steadypose.prior.models.occlusion.candidates import FEATURES, STANDING
 from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
 from steadypose.prior.models.posture import LivePosture
 from steadypose.training.recipes.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
 
-FRAMES, ARM, ELBOW_AT = 40, [J["left_elbow"], J["left_wrist"]], J["left_shoulder"]
+FRAMES, ARM = 40, [J["left_elbow"], J["left_wrist"]]
 
 
 class Asked:
@@ -61,6 +61,24 @@ def without_gaps(bodies: int = 1) -> Track:
 def bones(frame: Floats) -> Floats:
     """(B, 22, 3) metres: from each joint's parent to it, in a body like this frame's."""
     return frame - frame[:, PARENT]
+
+
+def placed(
+    joints: OccludedJoints,
+    truth: Floats,
+    seen: Floats,
+    sigma: Floats,
+    unseen: Floats,
+    completed: Floats,
+    completed_sigma: float,
+) -> Placed:
+    """What is said of one body (1, 22, 3), whose bones are known, of which no joint is seen again within the delay."""
+    again, deviations = np.zeros((1, 22), dtype=bool), np.full((1, 22), completed_sigma)
+    answer = joints.update(
+        np.arange(1), seen, sigma, unseen, again, completed, deviations, bones(truth), without_gaps()
+    )
+    assert answer is not None
+    return answer
 
 
 def asked_of(truth: Floats, hidden: NDArray[np.bool_]) -> list[Occluded]:
@@ -124,11 +142,7 @@ def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_g
     for frame in truth:
         seen, completed = frame.copy(), frame + 0.02 * rng.standard_normal(frame.shape)
         seen[:, limb] = np.nan
-        answer = joints.update(
-            np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), completed, np.full((1, 22), 0.03),
-            bones(frame), without_gaps(),
-        )  # fmt: skip
-        assert answer is not None
+        answer = placed(joints, frame, seen, sigma, unseen, completed, 0.03)
         assert answer.joints.tolist() == [[0, joint] for joint in limb]
         above = PARENT[limb[0]]
         standing = frame[0, above] + (STANDING[limb] - STANDING[above]) @ yaw_matrix(facing(frame))[0].T
@@ -147,11 +161,7 @@ def test_limbs_that_were_never_seen_are_stated_less_sure_and_those_seen_in_part_
     unseen, sigma, seen = np.zeros((1, 22)), np.full((1, 22), 0.005), standing.copy()
     for gone in (LEG, arm, part, ARM[1:]):
         unseen[:, gone], sigma[:, gone], seen[:, gone] = np.inf, np.inf, np.nan
-    answer = joints.update(
-        np.arange(1), seen, sigma, unseen, np.zeros((1, 22), dtype=bool), standing, np.full((1, 22), 0.05),
-        bones(standing), without_gaps(),
-    )  # fmt: skip
-    assert answer is not None
+    answer = placed(joints, standing, seen, sigma, unseen, standing, 0.05)
     stated = dict(zip(answer.joints[:, 1].tolist(), answer.sigma.tolist(), strict=True))
     expected = dict.fromkeys(sorted((*LEG, *arm, *part, ARM[1])), 0.05) | dict.fromkeys(LEG, 0.07)
     expected |= dict.fromkeys(arm[1:], 0.08)
@@ -163,12 +173,8 @@ def test_what_was_last_seen_is_forgotten_until_the_completions_deviation_is_stat
     for second in range(15):
         unseen = np.zeros((1, 22))
         unseen[:, ARM] = second
-        answer = joints.update(
-            np.arange(1), standing, 0.003 + 0.1 * unseen, unseen, np.zeros((1, 22), dtype=bool), standing,
-            np.full((1, 22), 0.1), bones(standing), without_gaps(),
-        )  # fmt: skip
+        answer = placed(joints, standing, standing, 0.003 + 0.1 * unseen, unseen, standing, 0.1)
         if second:
-            assert answer is not None
             stated.append(answer.sigma.min())
     assert min(stated[10:]) >= 0.1 > stated[0]
 
@@ -228,12 +234,7 @@ def test_what_ships_believes_a_foot_that_stands_more_than_its_completion() -> No
     wrong = standing + (0.0, 0.2, 0.0)
     for frame in range(60):
         unseen[:, feet] = max(frame - 10, 0) / 30
-        sigma = 0.003 + 0.1 * unseen
-        answer = joints.update(
-            np.arange(1), standing, sigma, unseen.copy(), np.zeros((1, 22), dtype=bool), wrong, np.full((1, 22), 0.1),
-            bones(standing), without_gaps(),
-        )  # fmt: skip
-        assert answer is not None
+        answer = placed(joints, standing, standing, 0.003 + 0.1 * unseen, unseen.copy(), wrong, 0.1)
         if len(answer.joints):
             found.append(answer)
     off = np.array([np.linalg.norm(each.positions - standing[0, feet], axis=-1) for each in found])

@@ -12,6 +12,7 @@ from steadypose.prior.models.posture import (
     RootCovariance,
     average_root,
     on_bones,
+    rigid_covariance,
     rigid_pelvis,
 )
 
@@ -105,3 +106,20 @@ def test_a_perfect_root_is_said_to_be_as_sure_as_any(posture: LivePosture, joint
     root = _root(posture, joints, 0.0)
     covariance = RootCovariance()(joints, np.zeros((BODIES, 22)), root)
     np.testing.assert_allclose(covariance, np.broadcast_to(LEAST_SIGMA**2 * np.eye(3), covariance.shape), atol=1e-6)
+
+
+def test_a_rigid_pelvis_is_turned_as_its_bones_are() -> None:
+    turns = random_pose(np.random.default_rng(0), BODIES, 0.4)
+    np.testing.assert_allclose(rigid_pelvis(fk(turns), OFFSETS), turns[:, 0], atol=1e-9)
+
+
+def test_its_covariance_is_the_spread_of_noisy_pelvises() -> None:
+    rng, count = np.random.default_rng(1), 4000
+    turns = np.repeat(random_pose(rng, 1, 0.4), count, axis=0)
+    sigma = np.full((count, 22), 0.002)
+    sigma[:, [0, 3]] = 0.004
+    bones = np.broadcast_to(REST_OFFSETS, (count, 22, 3))
+    noisy = rigid_pelvis(fk(turns) + rng.normal(0.0, 1.0, (count, 22, 3)) * sigma[..., None], bones)
+    spread = np.cov(Rotation.from_matrix(turns[:, 0].swapaxes(-1, -2) @ noisy).as_rotvec().T)
+    stated = rigid_covariance(sigma[:1], bones[:1])[0]
+    np.testing.assert_allclose(stated, spread, atol=0.06 * np.trace(spread))

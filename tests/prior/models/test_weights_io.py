@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -34,3 +35,10 @@ def test_a_damaged_file_and_one_without_configuration_are_refused(tmp_path: Path
     save_file({"head.weight": np.zeros(1), "unit.weight": np.zeros(1)}, path)
     with pytest.raises(WeightsError, match="no configuration"):
         load_weights(str(path), "contacts")
+
+
+def test_the_digests_that_go_with_each_release_are_of_all_weights() -> None:
+    lines = [line.split() for line in (WEIGHTS / "SHA256SUMS").read_text().splitlines()]
+    listed = {name: digest for digest, name in lines}
+    found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in WEIGHTS.glob("*.[sj]*")}
+    assert listed == found, "in prior/weights: sha256sum *.safetensors *.json > SHA256SUMS"

@@ -59,8 +59,6 @@ def test_a_body_hides_the_one_behind_it_and_not_the_other_way_about() -> None:
     eye = np.array([0.0, 0.0, 1.2])
     assert sight(far.positions, [near, far], eye).hidden[0, J["spine2"]] > 0.9
     assert sight(near.positions, [near, far], eye).hidden[0, J["spine2"]] < 0.1
-    depth = sight(far.positions, [near, far], eye).in_front[0, J["spine2"]]
-    assert 1.7 < depth < 2.0, "the surface of the nearer body"
 
 
 points = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)

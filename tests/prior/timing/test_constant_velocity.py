@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from steadypose.prior.timing.kalman import ConstantVelocityFilter
+from steadypose.prior.timing.kalman import INITIAL_SPEED, ConstantVelocityFilter
 
-DENSITY, SIGMA, INITIAL_SPEED = 3.0, 0.02, 0.7
+DENSITY, SIGMA = 3.0, 0.02
 
 
 def stream(seed: int, frames: int = 20, joints: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +47,7 @@ def dense_posterior(values: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray,
 @given(seed=st.integers(0, 10**6))
 def test_every_estimate_is_the_posterior_given_the_frames_so_far(seed: int) -> None:
     positions, stamps = stream(seed)
-    kalman = ConstantVelocityFilter(DENSITY, SIGMA, INITIAL_SPEED)
+    kalman = ConstantVelocityFilter(DENSITY, SIGMA)
     for frame, (measured, stamp) in enumerate(zip(positions, stamps, strict=True)):
         estimate = kalman.update(measured, stamp)
         assert estimate.stamp_s == stamp
@@ -91,14 +91,10 @@ def test_a_forgotten_joint_starts_anew_and_leaves_the_others_alone() -> None:
             np.testing.assert_array_equal(a.sigma[1], c.sigma[1])
 
 
-def test_refuses_a_stamp_that_does_not_increase_a_changed_shape_and_settings_without_meaning() -> None:
+def test_refuses_a_stamp_that_does_not_increase_until_it_is_reset() -> None:
     kalman = ConstantVelocityFilter(1.0)
     kalman.update(np.zeros((2, 3)), 1.0)
     with pytest.raises(ValueError, match=r"stamp after 1\.0 s"):
         kalman.update(np.zeros((2, 3)), 1.0)
-    with pytest.raises(ValueError, match=r"shape \(2, 3\)"):
-        kalman.update(np.zeros((3, 3)), 2.0)
     kalman.reset()
     kalman.update(np.zeros((3, 3)), 0.5)
-    with pytest.raises(ValueError, match="above 0"):
-        ConstantVelocityFilter(0.0)

@@ -1,9 +1,14 @@
-"""Medians without what is missing."""
+"""Medians, of arrays and in loops, are numpy's."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from steadypose.prior.arrays import medians
+from steadypose.prior.compiled import median
 
 
 @pytest.mark.filterwarnings("ignore:All-NaN slice")
@@ -14,3 +19,11 @@ def test_medians_are_numpys_without_what_is_missing(count: int) -> None:
     values[rng.random(values.shape) < rng.random(40)] = np.nan
     for axis in (0, 1):
         assert np.array_equal(medians(values, axis), np.nanmedian(values, axis=axis), equal_nan=True)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30))
+def test_the_median_of_loops_is_numpys(values: list[float]) -> None:
+    given_ = np.array(values)
+    before = given_.copy()
+    assert median(given_) == np.median(given_)
+    assert np.array_equal(given_, before)
