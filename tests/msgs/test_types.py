@@ -103,27 +103,16 @@ def test_from_up_refuses_other_axes(up: str):
 
 
 def test_the_definitions_name_joints_and_states_alike():
-    constants = _constants("CleanBody")
-    assert [constants[name.upper()] for name in JOINTS] == list(range(22))
-    assert {s.name: s.value for s in JointState} == _with_prefix(constants, "STATE_")
-    assert {t.name: t.value for t in Tracking} == _with_prefix(_constants("WorldBody"), "TRACKING_")
+    body = constants("CleanBody")
+    assert [body[name.upper()] for name in JOINTS] == list(range(22))
+    assert constants("CleanBody", "STATE_") == {state.name: state.value for state in JointState}
+    assert constants("WorldBody", "TRACKING_") == {tracking.name: tracking.value for tracking in Tracking}
     assert set(CONTACTS) < set(JOINTS)
-    event = _constants("Event")
-    kinds = {kind.name: kind.value for kind in EventKind}
-    phases = {phase.name: phase.value for phase in Phase}
-    assert {
-        name: value for name, value in event.items() if not name.startswith("HAND_") or name in kinds
-    } == kinds | phases
-    assert {f"HAND_{hand.name}": hand.value for hand in Hand}.items() <= event.items()
+    names = {one.name: one.value for kind in (EventKind, Phase) for one in kind}
+    assert constants("Event") == names | {f"HAND_{hand.name}": hand.value for hand in Hand}
 
 
-def _definition(name: str):
-    return get_types_from_msg((DEFINITIONS / f"{name}.msg").read_text(), name)[f"msg/{name}"]
-
-
-def _constants(name: str) -> dict[str, Any]:
-    return {constant: value for constant, _, value in _definition(name)[0]}
-
-
-def _with_prefix(constants: dict[str, Any], prefix: str) -> dict[str, Any]:
-    return {name.removeprefix(prefix): value for name, value in constants.items() if name.startswith(prefix)}
+def constants(name: str, prefix: str = "") -> dict[str, Any]:
+    """Values of a definition's constants with this prefix, by the rest of their names."""
+    declared = get_types_from_msg((DEFINITIONS / f"{name}.msg").read_text(), name)[f"msg/{name}"][0]
+    return {constant.removeprefix(prefix): value for constant, _, value in declared if constant.startswith(prefix)}

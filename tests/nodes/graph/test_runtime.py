@@ -21,15 +21,9 @@ MakeLaunch = Callable[..., Launch]
 
 def clean(message: PoseRaw) -> PoseClean:
     return PoseClean(
-        stamp_ns=message.stamp_ns,
-        frame_id=message.frame_id,
-        source=message.source,
-        sensor_pose=message.sensor_pose,
-        calibrated=message.calibrated,
-        delay_frames=0,
-        bodies=[],
-        end_of_stream=message.end_of_stream,
-    )
+        message.stamp_ns, message.frame_id, message.source, message.sensor_pose, message.calibrated, 0, [],
+        message.end_of_stream,
+    )  # fmt: skip
 
 
 class Echo(Node):

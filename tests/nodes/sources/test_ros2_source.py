@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import VirtualClock, another_python, raw, running, until, walking
+from tests.helpers.given import Given
 from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.codec import MAX_BODIES
@@ -19,7 +20,6 @@ from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.pose_input import PoseInputNode
-from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
@@ -91,27 +91,11 @@ def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: 
     assert source.status()["camera"].startswith("/skeletons, ")
 
 
-class Topic(LiveSource):
-    """A source that gives these frames."""
-
-    def __init__(self, *found: PoseRaw) -> None:
-        super().__init__()
-        self._frames = found
-
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        yield from self._frames
-        while True:
-            yield None
-
-    def status(self) -> dict[str, str]:
-        return {}
-
-
 def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(
     make_launch: Callable[..., Launch], clock: VirtualClock
 ) -> None:
     crowd = from_pose_array(pose_array(22 * (MAX_BODIES + 1)), CANONICAL, "z")
-    frames = Topic(raw(1, walking(1)), crowd, raw(2, walking(2)))
+    frames = Given(raw(1, walking(1)), crowd, raw(2, walking(2)))
     source = PoseInputNode(make_launch(transport__lossless="false"), clock, frames)
     with running(source):
         until(lambda: source.health.published[POSE_RAW] == 2)

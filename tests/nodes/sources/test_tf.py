@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,14 @@ from conftest import VirtualClock, raw, walking
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.helpers.given import Given
 
-from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.ros2.definitions import Connection, Publish, serialise
+from steadypose.nodes.ros2.definitions import serialise
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2.messages import tf_message, transform
 from steadypose.nodes.sources import ros2 as module
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.ros2 import CACHE_NS, TfSettings, TfSource, TransformBuffer, TransformError
-from steadypose.nodes.sources.source import LiveSource
 
 FRAME_NS = 33_333_333
 
@@ -75,18 +74,12 @@ def test_it_forgets_what_is_old_and_begins_anew_where_time_does() -> None:
     assert buffer.lookup("odom", "base", 5)[0][0] == 7.0
 
 
-class Robot(Connection):
+class Robot:
     """In the place of ROS: says what the test tells it to, when it is listened to."""
 
     def __init__(self) -> None:
         self.heard: dict[str, Callable[[bytes], None]] = {}
         self.queue: list[tuple[str, Any]] = []
-
-    def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
-        raise AssertionError("a source publishes nothing")
-
-    def drop(self, publish: Publish) -> None:
-        raise AssertionError("a source publishes nothing")
 
     def subscribe(
         self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth: int = 10
@@ -102,24 +95,11 @@ class Robot(Connection):
         self.heard.clear()
 
 
-class Camera(LiveSource):
-    def __init__(self, frames: list[PoseRaw | None]) -> None:
-        super().__init__()
-        self._frames = frames
-
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        yield from self._frames
-
-    def status(self) -> dict[str, str]:
-        return {}
-
-
 def test_a_message_waits_for_the_transform_of_its_stamp(clock: VirtualClock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "check_ros", lambda: None)
     robot, frame = Robot(), raw(0, walking(0), stamp_ns=2_000)
-    source = TfSource(
-        Camera([frame, None, None]), TfSettings(fixed_frame="odom", sensor_frame="eye"), clock, lambda _: robot
-    )
+    settings = TfSettings(fixed_frame="odom", sensor_frame="eye")
+    source = TfSource(Given(frame, None, None), settings, clock, lambda _: robot)  # type: ignore[arg-type, return-value]
     frames = source.frames()
     robot.queue = [("tf_static", said(0, "base", "eye", [0, 0, 1.5], Rotation.from_euler("z", 90, degrees=True)))]
     robot.queue.append(("tf", said(1_000, "odom", "base", [0, 0, 0], Rotation.identity())))
@@ -137,7 +117,8 @@ def test_a_message_waits_for_the_transform_of_its_stamp(clock: VirtualClock, mon
 
 def test_one_that_waits_in_vain_is_dropped_and_told(clock: VirtualClock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "check_ros", lambda: None)
-    source = TfSource(Camera([raw(0, walking(0)), None]), TfSettings(fixed_frame="odom"), clock, lambda _: Robot())
+    settings = TfSettings(fixed_frame="odom")
+    source = TfSource(Given(raw(0, walking(0)), None), settings, clock, lambda _: Robot())  # type: ignore[arg-type]
     frames = source.frames()
     assert next(frames) is None
     clock.time_ns += 300_000_000
