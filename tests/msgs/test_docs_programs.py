@@ -22,6 +22,8 @@ from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import PoseRaw
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[2] / "docs"
 SOON_S = 30.0
 

@@ -153,6 +153,7 @@ print(*(name for name in sys.modules if name in ("numba.np.arrayobj", "numba.cpy
 """
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_loaded_without_the_modules_of_a_compiler(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     outputs = [

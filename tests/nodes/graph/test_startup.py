@@ -12,6 +12,8 @@ from numba.core.dispatcher import Dispatcher
 from steadypose.nodes.graph import trajectory_node
 from steadypose.nodes.graph.loops import _locked, compile_from_the_beginning, compile_from_the_end
 
+pytestmark = pytest.mark.slow
+
 SPARED = ("asyncio", "scipy.linalg", "scipy.sparse", "scipy.spatial", "torch", "tyro", "rich", "mcap")
 SCRIPT = """
 import gc, sys

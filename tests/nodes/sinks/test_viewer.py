@@ -237,6 +237,7 @@ def test_the_server_listens_on_this_machine_alone_and_at_a_port_that_is_free() -
     ViewerServer(port).close()
 
 
+@pytest.mark.slow
 def test_the_server_goes_with_a_node_that_is_killed() -> None:
     port = free_port()
     code = (
