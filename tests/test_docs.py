@@ -77,13 +77,10 @@ def blocks(page: Path) -> list[Block]:
 def away() -> Iterator[Path]:
     """A folder with what the commands name: the command itself, its Python, launch files, and short streams."""
     folder = Path(tempfile.mkdtemp(prefix="sp"))  # short: an address of a socket has 107 bytes at most
-    command = folder / "steadypose"
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m steadypose.nodes.cli "$@"\n')
-    command.chmod(0o755)
     (folder / ".venv" / "bin").mkdir(parents=True)
-    python = folder / ".venv" / "bin" / "python"
-    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n')
-    python.chmod(0o755)
+    for path, run in (("steadypose", "-m steadypose.nodes.cli"), (".venv/bin/python", "")):
+        (folder / path).write_text(f'#!/bin/sh\nexec "{sys.executable}" {run} "$@"\n')
+        (folder / path).chmod(0o755)
     (folder / "launch").symlink_to((PACKAGE / "launch").resolve())
     for name in STREAMS:
         (folder / "sim_data").mkdir(exist_ok=True)

@@ -42,15 +42,8 @@ def test_the_wrapper_runs_where_the_caller_stands(checkout: Path, tmp_path: Path
         program = "./pose"
     elif through == "PATH":
         program, environment["PATH"] = "steadypose", f"{checkout}:{environment['PATH']}"
-    done = subprocess.run(
-        [program, "clean", "a b.npz", "out/"],
-        cwd=elsewhere,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == f"{elsewhere}\nclean|a b.npz|out/|"
+    printed = subprocess.check_output([program, "clean", "a b.npz", "out/"], cwd=elsewhere, env=environment, text=True)
+    assert printed == f"{elsewhere}\nclean|a b.npz|out/|"
 
 
 @pytest.mark.parametrize("version", [(3, 9), (3, 14), None])
@@ -85,10 +78,7 @@ def test_where_ros_is_sourced_its_python_is_taken(checkout: Path, tmp_path: Path
     script = 'root=. && . ./setup-environment.sh && basename "$(find_python)"'
     for ros, taken in (({}, "python3.11"), ({"ROS_DISTRO": "jazzy"}, "python3")):
         environment = {"PATH": f"{names}:/usr/bin:/bin"} | ros
-        done = subprocess.run(
-            ["sh", "-c", script], cwd=checkout, env=environment, capture_output=True, text=True, check=True
-        )
-        assert done.stdout == f"{taken}\n"
+        assert subprocess.check_output(["sh", "-c", script], cwd=checkout, env=environment, text=True) == f"{taken}\n"
 
 
 def test_a_wheel_holds_one_package_with_all_that_running_takes(tmp_path: Path) -> None:

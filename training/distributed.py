@@ -68,10 +68,10 @@ def from_first(value: T) -> T:
 def average_gradients(optimiser: Optimizer) -> None:
     """Average the gradients of all processes before each step of an optimiser."""
     if processes() > 1:
-        optimiser.register_step_pre_hook(lambda stepping, *_: _average(stepping))
+        optimiser.register_step_pre_hook(_average)
 
 
-def _average(optimiser: Optimizer) -> None:
+def _average(optimiser: Optimizer, *_: object) -> None:
     # all processes have gradients for the same parameters: these depend on the step, not on the samples
     parameters = [p for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
     total = torch.cat([parameter.grad.reshape(-1) for parameter in parameters])

@@ -30,8 +30,7 @@ Network = TypeVar("Network", bound=nn.Module)
 Rng = np.random.Generator
 
 Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float]]]
-"""Type of a loss function: returns the loss of a random batch, and terms to plot. It is called with the number of
-samples, the progress of the training in [0, 1), and a random generator, which differs between torchrun's processes."""
+"""Type of `Recipe.loss` without its network."""
 
 
 @dataclass(frozen=True)
@@ -221,12 +220,7 @@ class TrainingRun:
     ) -> None:
         """Run the remaining steps, with evaluations, checkpoints and curves at intervals and at the end.
 
-        Args:
-            loss: the loss function, called with the model in training mode.
-            evaluate: returns further quantities to plot; called in evaluation mode, without gradients.
-            batch: samples per step, of all processes together.
-            seed: random seed of the batches.
-            clip: maximum norm of the gradient.
+        ``seed`` is that of the batches; for the others, see `Recipe`.
         """
         parameters = [parameter for group in self._optimiser.param_groups for parameter in group["params"]]
         columns = (
@@ -234,9 +228,8 @@ class TrainingRun:
             TimeRemainingColumn(), TextColumn("{task.fields[result]}"),
         )  # fmt: skip
         with Progress(*columns, disable=not writes()) as progress:
-            task = progress.add_task(
-                self.directory.name, total=self.iterations, completed=self.step, result=self._latest()
-            )
+            name = self.directory.name
+            task = progress.add_task(name, total=self.iterations, completed=self.step, result=self._latest())
             while self.step < self.iterations:
                 self._model.train()
                 rng = np.random.default_rng((seed, self.step, rank()))
@@ -266,11 +259,8 @@ class TrainingRun:
             ``path``.
         """
         curves = path.with_suffix(".png")
-        found = {
-            "Validation": ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items()),
-            "Curves": f"`{curves.name}`",
-        }
-        save_weights(path, model, config, {**card, **found})
+        latest = ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items())
+        save_weights(path, model, config, {**card, "Validation": latest, "Curves": f"`{curves.name}`"})
         draw_curves(self.curves, curves)
         return path
 

@@ -33,10 +33,14 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
     _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
-    lines = [f"# {path.stem}", ""]
-    for heading, content in {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}.items():
-        lines += [f"- **{heading}**: {content}"]
-    _write_whole(path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
+    write_card(path, card)
+
+
+def write_card(path: Path, card: Mapping[str, Any]) -> None:
+    """Write the card (heading to content) of the weights ``path`` beside them, with commit and machine."""
+    whole = {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}
+    lines = [f"# {path.stem}", "", *(f"- **{heading}**: {content}" for heading, content in whole.items()), ""]
+    _write_whole(path.with_suffix(".md"), "\n".join(lines).encode())
 
 
 def install(path: Path) -> Path:
@@ -93,13 +97,9 @@ def _write_whole(path: Path, content: bytes) -> None:
 
 def _commit() -> str:
     try:
-        found = subprocess.run(
-            ["git", "describe", "--always", "--dirty"],
-            cwd=weights_io.WEIGHTS.parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        command = ["git", "describe", "--always", "--dirty"]
+        return subprocess.check_output(
+            command, cwd=weights_io.WEIGHTS.parent, stderr=subprocess.DEVNULL, text=True
+        ).strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return found.stdout.strip()

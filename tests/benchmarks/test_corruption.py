@@ -73,7 +73,6 @@ def test_the_trunk_hides_the_arm_on_its_far_side_only() -> None:
 
 
 def test_what_is_below_a_height_is_hidden() -> None:
-    body = resting()
-    seen = hide(body, below(body))
+    seen = hide(resting(), below(resting()))
     assert np.isnan(seen[..., J["left_knee"], :]).all()
     assert np.isfinite(seen[..., J["head"], :]).all()

@@ -20,15 +20,9 @@ def test_the_command_knows_every_protocol_and_asks_for_what_it_needs() -> None:
 
 
 def test_all_is_every_protocol_in_turn_without_what_is_not_here(tmp_path: Path, capsys, monkeypatch) -> None:
-    ran = []
-
-    class Module:
-        @staticmethod
-        def run(bench: Bench) -> Result:
-            ran.append(bench)
-            return Result([], {})
-
-    monkeypatch.setattr("importlib.import_module", lambda _: Module)
+    ran: list[Bench] = []
+    study = SimpleNamespace(run=lambda bench: ran.append(bench) or Result([], {}))
+    monkeypatch.setattr("importlib.import_module", lambda _: study)
     evaluate("all", quick=True, data=tmp_path / "nowhere.npz")
     assert len(ran) == len(STUDIES) - len(SENSORS) - len(PREPARED)
     assert len(set(map(id, ran))) == 1  # what is trained for one protocol serves the others
@@ -39,12 +33,8 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
     log, data = tmp_path / "results" / "test-readings.csv", tmp_path / "prepared.npz"
     monkeypatch.setattr(results, "READINGS", log)
 
-    class Module:
-        @staticmethod
-        def run(bench: Bench) -> Result:
-            raise ZeroDivisionError  # scored in part, it has been read
-
-    monkeypatch.setattr("importlib.import_module", lambda _: Module)
+    # scored in part, it has been read
+    monkeypatch.setattr("importlib.import_module", lambda _: SimpleNamespace(run=lambda bench: 1 / 0))
 
     def read(study: str, split: Literal["val", "test"]) -> None:
         with pytest.raises(ZeroDivisionError):

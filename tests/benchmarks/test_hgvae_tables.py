@@ -17,15 +17,9 @@ SMALL = HGVAEConfig(features=16, levels=(Level(1, 8), Level(JOINT_NODES, 2)))
 
 def windows() -> Windows:
     """Of somebody who waves, 80 frames."""
-    return Windows(
-        MotionSet(
-            rotations=torch.eye(3).expand(80, 22, 3, 3),
-            positions=torch.from_numpy(waving(80)).float(),
-            offsets=torch.from_numpy(np.tile(REST_OFFSETS, (80, 1, 1))).float(),
-            contacts=torch.zeros(80, 8, dtype=torch.bool),
-            clip_start=np.arange(2) * 80,
-        )
-    )
+    positions, offsets = torch.from_numpy(waving(80)).float(), torch.from_numpy(REST_OFFSETS).float()
+    whole = torch.eye(3).expand(80, 22, 3, 3), positions, offsets.expand(80, 22, 3), torch.zeros(80, 8)
+    return Windows(MotionSet(*whole, np.array([0, 80])))
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -55,10 +49,15 @@ def test_left_for_right_is_the_other_sides_joint() -> None:
     np.testing.assert_array_equal(corrupted[0, :, J["left_wrist"]], clean[0, :, MIRROR[J["left_wrist"]]])
 
 
-def test_every_method_gives_back_what_was_seen_and_peers_are_what_they_are_called() -> None:
+@pytest.fixture
+def model() -> HGVAE:
     torch.manual_seed(0)
     model = HGVAE(SMALL).eval().requires_grad_(requires_grad=False)
     model.mean.copy_(mean_tracks(windows(), 50, count=4))
+    return model
+
+
+def test_every_method_gives_back_what_was_seen_and_peers_are_what_they_are_called(model: HGVAE) -> None:
     positions, sizes = windows().draw(2, 50, np.random.default_rng(0))
     masks = np.zeros((2, 66, 50), dtype=bool)
     masks[:, 60, 10:20] = True
@@ -73,10 +72,7 @@ def test_every_method_gives_back_what_was_seen_and_peers_are_what_they_are_calle
     assert found["mean"][0][0, 63, 0] == pytest.approx(float(model.mean[63]))
 
 
-def test_only_what_is_hidden_counts_as_an_error_of_whole_joints() -> None:
-    torch.manual_seed(0)
-    model = HGVAE(SMALL).eval()
-    model.mean.copy_(mean_tracks(windows(), 50, count=4))
+def test_only_what_is_hidden_counts_as_an_error_of_whole_joints(model: HGVAE) -> None:
     positions, sizes = windows().draw(2, 50, np.random.default_rng(0))
     hidden = np.zeros((2, 22), dtype=bool)
     hidden[1, J["left_wrist"]] = True
@@ -93,9 +89,7 @@ def test_only_what_is_hidden_counts_as_an_error_of_whole_joints() -> None:
     assert found["guess"][1] == pytest.approx(1e6 * ((true[wrist] - true[elbow]) ** 2).sum(), rel=1e-4)
 
 
-def test_the_papers_ascent_never_ends_lower_than_it_began() -> None:
-    torch.manual_seed(0)
-    model = HGVAE(SMALL).eval()
+def test_the_papers_ascent_never_ends_lower_than_it_began(model: HGVAE) -> None:
     x = np.random.default_rng(0).normal(scale=0.2, size=(3, 66, 50))
     observed = np.random.default_rng(1).random(x.shape) < 0.8
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from steadypose.benchmarks import output, provenance
-from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, machine, measured, ships, stale
+from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
 from steadypose.benchmarks.report import Args, fill, main, page
 from steadypose.benchmarks.results import Study, Table, load, save
 from steadypose.benchmarks.stale import STALE
@@ -50,16 +50,15 @@ def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tm
     assert readme.read_text() == once
 
 
-def test_a_marker_without_a_result_is_an_error_that_names_those_there_are(tmp_path: Path) -> None:
-    saved(tmp_path)
-    with pytest.raises(KeyError, match=r"results:other.*speed"):
-        fill("<!-- results:other -->\n<!-- /results -->", load(tmp_path))
-
-
-def test_blocks_do_not_swallow_each_other(tmp_path: Path) -> None:
-    filled = fill(TEXT + "between\n" + TEXT, {"latency": saved(tmp_path)})
+def test_every_block_is_filled_for_itself_and_one_without_a_result_is_an_error_that_names_those_there_are(
+    tmp_path: Path,
+) -> None:
+    results = {"latency": saved(tmp_path)}
+    filled = fill(TEXT + "between\n" + TEXT, results)
     assert filled.count("| steadypose |") == 2
     assert "between" in filled
+    with pytest.raises(KeyError, match=r"results:other.*speed"):
+        fill("<!-- results:other -->\n<!-- /results -->", results)
 
 
 def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: Path) -> None:
@@ -70,16 +69,6 @@ def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: 
     assert "**stale: the reason**" in fill(TEXT, results, {"latency": "the reason"})
     assert "code is at commit abc1234" in fill(levels, results, {})
     assert "**stale: the reason**" in page(results, {"latency": "the reason"})
-
-
-def test_a_result_is_stale_when_weights_have_changed_and_a_finished_one_never(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result = saved(tmp_path)
-    changed = ships() | {"humor weights": "others"}
-    monkeypatch.setattr(provenance, "ships", lambda: changed)
-    assert stale(result) == ["humor weights"]
-    assert stale(result | {"frozen": "abc1234"}) == []
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,15 +89,21 @@ def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
     assert saved(tmp_path)
 
 
-def test_a_result_is_stale_when_what_made_it_is_not_there_any_more(tmp_path: Path) -> None:
+def test_a_result_is_stale_when_weights_or_what_made_it_have_changed_and_a_finished_one_never(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result = saved(tmp_path)
     assert stale(result) == []
     assert {"CONDITIONS", "run", "below", "ConditionalGaussian", "RIDGE", "search"} <= {
         line.split()[0] for line in result["code"]
     }, "the study's own definitions, and those of corruption, baselines and the parameter search"
+    changed = ships() | {"humor weights": "others"}
+    monkeypatch.setattr(provenance, "ships", lambda: changed)
+    assert stale(result) == ["humor weights"]
     result["code"] += ["NOISE 01234567", "gone 89abcdef"]
     result["measured"]["prior.fit"] = "other"
-    assert stale(result) == ["prior.fit", "code (NOISE, gone)"]
+    assert stale(result) == ["humor weights", "prior.fit", "code (NOISE, gone)"]
+    assert stale(result | {"frozen": "abc1234"}) == []
     del result["code"]
     assert stale(result) == ["output (not recorded)"]
 
@@ -158,11 +153,3 @@ def test_readme_and_page_hold_what_was_measured() -> None:
     readme = (ROOT / "README.md").read_text()
     assert fill(readme, results) == readme
     assert page(results) == (ROOT / "docs" / "results.md").read_text()
-
-
-def test_the_machine_is_described() -> None:
-    found = machine()
-    assert found["cpu"]
-    assert int(found["cores"]) >= 1
-    assert float(found["memory_gb"]) > 0
-    assert set(found) >= {"load_1min", "python", "torch", "commit", "date"}

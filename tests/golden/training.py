@@ -85,8 +85,7 @@ def digest_of(recipe: str, data: Path, arrays: Path, folder: Path) -> str:
 def outcomes(prepared: Path, mocap: Path, arrays: Path) -> Iterator[tuple[str, str]]:
     """Name and digest of every recipe's training."""
     torch.set_num_threads(1)
-    if not (arrays / "pairs.npz").is_file():
-        write_arrays(mocap, arrays)
+    write_arrays(mocap, arrays)
     with tempfile.TemporaryDirectory() as folder:
         few_clips(prepared, Path(folder) / "few.npz")
         for recipe in (name for name in RECIPES if name != "hgvae-wide"):

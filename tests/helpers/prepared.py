@@ -20,7 +20,7 @@ def write_motion(
 ) -> Path:
     """Clips (T, 22, 3) metres, z up, of the rest skeleton; returns ``path``."""
     positions = np.concatenate(clips).astype(np.float32)
-    same = {"set": "default", "subject": "somebody", "source": "synthetic", "action": "moving"}
+    same = {"set": "default", "subject": "somebody", "source": "synthetic"}
     np.savez(
         path,
         positions=positions,

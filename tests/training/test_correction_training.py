@@ -37,13 +37,22 @@ def test_what_is_missing_is_in_the_trunks_frame_of_the_pose_beside_it() -> None:
     np.testing.assert_allclose(x, features(still, CAMERA), atol=1e-9)
 
 
+def standing(seed: int) -> np.ndarray:
+    """(20, 22, 3) somebody of random joints who stands still."""
+    return np.random.default_rng(seed).normal(0.0, 0.4, (22, 3)) + np.zeros((20, 1, 1))
+
+
+def pair(kinect: np.ndarray, vicon: np.ndarray) -> KinectPair:
+    return KinectPair("a", "s01", "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3)))
+
+
 def test_a_kinect_is_moved_to_vicon_by_joints_that_both_have_throughout() -> None:
-    kinect = np.random.default_rng(0).normal(0.0, 0.4, (22, 3)) + np.zeros((20, 1, 1))
+    kinect = standing(0)
     seen = to_canonical(KINECT22, kinect)[0]
     vicon, wrist = seen @ TURN.T + SHIFT, J["left_wrist"]
     vicon[:, wrist] = (seen[:, wrist] + [0.0, 0.2, 0.0]) @ TURN.T + SHIFT
     vicon[3, wrist] = np.nan
-    missing = sensor_bias._clip(KinectPair("a", "s01", "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3))))[1]
+    missing = sensor_bias._clip(pair(kinect, vicon))[1]
     others = np.delete(missing, wrist, axis=1)
     np.testing.assert_allclose(others[np.isfinite(others)], 0.0, atol=1e-9)
     np.testing.assert_allclose(missing[5, wrist], [0.0, 0.2, 0.0] @ trunk_frame(seen)[5], atol=1e-9)
@@ -85,8 +94,7 @@ def test_a_bias_is_learned_of_either_side_and_the_card_says_of_whom(tmp_path: Pa
     path = train_sensor([*takes(), takes()[0]], TrainingOptions(tmp_path, tmp_path, "mine", iterations=120))
     assert path == TrainingOptions(tmp_path, tmp_path, "mine").path("correction")
     card = path.with_suffix(".md").read_text()
-    for words in ("error of the sensor mine", "3 recordings of 2 people beside", "that of the recordings"):
-        assert words in card
+    assert all(words in card for words in ("sensor mine", "3 recordings of 2 people beside", "that of the recordings"))
     x, missing = sensor_bias._take(takes()[1])
     there = np.isfinite(x[:, 0])
     assert there.sum() == len(x) - 4
@@ -122,14 +130,12 @@ def test_a_kinects_correction_is_of_the_subjects_that_are_named(
 
     def load(data: Path, subjects: tuple[str, ...]) -> list[KinectPair]:
         read.extend((data, subject) for subject in subjects)
-        kinect = np.random.default_rng(len(read)).normal(0.0, 0.4, (22, 3)) + np.zeros((20, 1, 1))
-        vicon = to_canonical(KINECT22, kinect)[0]
-        return [KinectPair("a", subjects[0], "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3)))]
+        kinect = standing(len(read))
+        return [pair(kinect, to_canonical(KINECT22, kinect)[0])]
 
     monkeypatch.setattr(sensor_bias, "load_pairs", load)
     data = tmp_path / "of_this_test.npz"
     path = train_correction(TrainingOptions(data, tmp_path, "mine", iterations=1), ("s05", "s02"))
     assert read == [(data, "s05"), (data, "s02")]
     card = path.with_suffix(".md").read_text()
-    for words in ("systematic error of a Kinect v2", "Kinect beside Vicon: s05, s02", "Apache-2.0"):
-        assert words in card
+    assert all(words in card for words in ("error of a Kinect v2", "Kinect beside Vicon: s05, s02", "Apache-2.0"))

@@ -1,4 +1,4 @@
-"""Training the trajectory network: it learns, resumes, and writes what the pipeline loads."""
+"""Training the trajectory network: what it is shown, how its errors are measured, and that what it writes loads."""
 
 from __future__ import annotations
 
@@ -87,29 +87,12 @@ def test_calibration_finds_the_size_of_the_errors(prepared: Path, monkeypatch: p
         assert config.correlation_s == pytest.approx((lasts, lasts), rel=0.25)
 
 
-def test_a_killed_training_goes_on_where_it_was(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
+def test_it_trains_and_writes_what_loads(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training, "BATCH", 4)
     monkeypatch.setattr(training, "WINDOW", 40)
     monkeypatch.setattr(training, "_SPAN", 84)
-    whole = training.train_trajectory(TrainingOptions(prepared, tmp_path / "a", iterations=4))
-    state, config = load_tensors(str(whole), "trajectory")
+    path = training.train_trajectory(TrainingOptions(prepared, tmp_path, iterations=2))
+    state, config = load_tensors(str(path), "trajectory")
     TrajectoryNet(TrajectoryConfig.from_dict(config)).load_state_dict(state)
-    assert (tmp_path / "a/trajectory-default/trajectory-default.md").read_text().startswith("# trajectory-default")
-    assert (tmp_path / "a/trajectory-default/trajectory-default.png").stat().st_size > 0
-
-    calls, loss = iter(range(10)), training._loss
-
-    def killed(*args):
-        if next(calls) == 2:
-            raise KeyboardInterrupt
-        return loss(*args)
-
-    monkeypatch.setattr(training, "_loss", killed)
-    options = TrainingOptions(prepared, tmp_path / "b", iterations=4)
-    with pytest.raises(KeyboardInterrupt):
-        training.train_trajectory(options)
-    resumed, _ = load_tensors(str(training.train_trajectory(options)), "trajectory")
-    assert next(calls) == 5
-    for name, tensor in state.items():
-        torch.testing.assert_close(resumed[name], tensor, rtol=0, atol=0)
+    assert path.with_suffix(".md").read_text().startswith("# trajectory-default")
+    assert path.with_suffix(".png").stat().st_size > 0

@@ -64,8 +64,7 @@ def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np
 
     Yields:
         For each clip: the share of clips read, its name, frames per second, and positions (T, J, 3) metres, y up, of
-            the
-        joints of the rig ``cmu_bvh``.
+            the joints of the rig ``cmu_bvh``.
     """
     with open_npz(file, "names", "parents", "offsets_m", "fps") as archive:
         joints = [str(n).replace("HeadEnd", "Head_end") for n in archive["names"]]
@@ -248,16 +247,14 @@ def _frames(text: str) -> Mapping[str, NDArray[np.float64]]:
     height = (starts[1] if len(starts) > 1 else len(lines)) - starts[0]
     if len(lines) != height * len(starts):
         raise MotionError(f"expected {height - 1} bones in each of {len(starts)} frames; the file is cut or mixed")
-    return dict(_columns(lines, height))
-
-
-def _columns(lines: list[str], height: int) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    columns: dict[str, NDArray[np.float64]] = {}
     for row in range(1, height):
         words = [line.split() for line in lines[row::height]]
         name, width = words[0][0], len(words[0])
         if any(w[0] != name or len(w) != width for w in words):
             raise MotionError(f"expected bone '{name}' in the same place in every frame")
         try:
-            yield name, np.array([w[1:] for w in words], dtype=np.float64).reshape(len(words), width - 1)
+            columns[name] = np.array([w[1:] for w in words], dtype=np.float64).reshape(len(words), width - 1)
         except ValueError as error:
             raise MotionError(f"bone '{name}': {error}") from error
+    return columns

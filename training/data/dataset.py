@@ -24,8 +24,7 @@ from steadypose.training.data.datasets import WeightSet
 MIN_SPEED = 0.25
 """Speed added to the joints' speed in the sampling weight of a window, m/s."""
 
-_ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "action",
-           "source"}  # fmt: skip
+_ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "source"}
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,6 @@ class MotionSet:
         contacts: (N, 8) labels.
         clip_start: (C + 1,) first frame of each clip, and the end.
         subject: (C,) person, as named by the source; empty if the clips' origin does not matter.
-        action: (C,) action, as named by the source; empty likewise.
         source: (C,) data set; empty likewise.
     """
 
@@ -49,7 +47,6 @@ class MotionSet:
     contacts: Tensor
     clip_start: NDArray[np.int64]
     subject: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
-    action: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
 
     @classmethod
@@ -88,7 +85,6 @@ class MotionSet:
             contacts=torch.from_numpy(data["contacts"][frames]),
             clip_start=np.concatenate([[0], np.cumsum(lengths)]),
             subject=data["subject"][wanted],
-            action=data["action"][wanted],
             source=data["source"][wanted],
         )
 
@@ -115,7 +111,7 @@ class MotionSet:
         return MotionSet(
             self.rotations[frames], self.positions[frames], self.offsets[frames], self.contacts[frames],
             np.concatenate([[0], np.cumsum(lengths)]),
-            *(names[clips] if len(names) else names for names in (self.subject, self.action, self.source)),
+            *(names[clips] if len(names) else names for names in (self.subject, self.source)),
         )  # fmt: skip
 
     def sample(

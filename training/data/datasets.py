@@ -36,57 +36,24 @@ CMU_FPS = 120.0
 """Frame rate of CMU's AMC files, which do not contain it, frames per second."""
 
 CMU_ACTIONS = {
-    "01": "playground",
-    "02_01": "walk",
-    "02_02": "walk",
-    "02_03": "run",
-    "02_04": "jump, balance",
-    "02_05": "punch",
-    "02_06": "bend, lift",
-    "02_07": "swordplay",
-    "02_08": "swordplay",
-    "02_09": "swordplay",
-    "02_10": "wash",
-    "06": "basketball",
-    "07": "walk",
-}
+    "01": "playground", "06": "basketball", "07": "walk", "02_01": "walk", "02_02": "walk", "02_03": "run",
+    "02_04": "jump, balance", "02_05": "punch", "02_06": "bend, lift",
+    **dict.fromkeys(("02_07", "02_08", "02_09"), "swordplay"), "02_10": "wash",
+}  # fmt: skip
 """Actions of CMU's recordings, by subject or by subject and trial."""
 
 REPEATS = {
     **{f"002_{trial:02d}": f"02_{trial:02d}" for trial in range(1, 11)},
     "006_01": "train_walking_3",
-    "006_02": "train_basketball_1",
-    "006_03": "train_basketball_2",
-    "006_04": "train_basketball_3",
-    "006_05": "train_basketball_4",
-    "006_06": "train_basketball_5",
-    "006_07": "test_basketball_1",
-    "007_01": "train_walking_4",
-    "007_02": "train_walking_5",
-    "train_walking_1": "02_01",
-    "08_02": "train_walking_13",
-    "08_03": "train_walking_14",
-    "08_08": "train_walking_15",
-    "08_09": "train_walking_16",
-    "08_10": "train_walking_17",
-    "10_01": "train_soccer_1",
-    "10_02": "train_soccer_2",
-    "10_03": "train_soccer_3",
-    "10_04": "train_walking_18",
-    "10_05": "train_soccer_4",
-    "10_06": "train_soccer_5",
-    "11_01": "test_soccer_1",
-    "12_01": "train_walking_19",
-    "12_02": "train_walking_20",
-    "12_03": "train_walking_21",
-    "13_11": "train_jumping_1",
-    "13_19": "train_jumping_3",
-    "13_26": "train_directing_traffic_1",
-    "13_32": "train_jumping_4",
-    "13_39": "train_jumping_5",
-    "14_12": "test_washwindow_1",
-    "14_36": "14_31",
-}
+    **{f"006_{trial:02d}": f"train_basketball_{trial - 1}" for trial in range(2, 7)},
+    "006_07": "test_basketball_1", "007_01": "train_walking_4", "007_02": "train_walking_5", "train_walking_1": "02_01",
+    "08_02": "train_walking_13", "08_03": "train_walking_14", "08_08": "train_walking_15", "08_09": "train_walking_16",
+    "08_10": "train_walking_17", "10_01": "train_soccer_1", "10_02": "train_soccer_2", "10_03": "train_soccer_3",
+    "10_04": "train_walking_18", "10_05": "train_soccer_4", "10_06": "train_soccer_5", "11_01": "test_soccer_1",
+    "12_01": "train_walking_19", "12_02": "train_walking_20", "12_03": "train_walking_21", "13_11": "train_jumping_1",
+    "13_19": "train_jumping_3", "13_26": "train_directing_traffic_1", "13_32": "train_jumping_4",
+    "13_39": "train_jumping_5", "14_12": "test_washwindow_1", "14_36": "14_31",
+}  # fmt: skip
 """Recordings that are in two CMU archives: the dropped one, and the kept one (nearer to the source, or for validation).
 
 They were identified by the bends of elbows and knees, frame by frame. These differ by 0.1 degrees for AMC and
@@ -158,28 +125,29 @@ class _Origin(NamedTuple):
     action: str = ""
 
 
-def _bvh_reader(
-    source: str, licence: str, origin_of: Callable[[str, Bvh], _Origin]
-) -> Callable[[Path, Progress], Iterator[Clip | Dropped]]:
-    """Reads the BVH files of an archive or folder."""
+def _bvh(
+    name: str, files: str, weights: Use, licence: str, origin_of: Callable[[str, Bvh], _Origin],
+    split: Callable[[Clip], Split],
+) -> DataSet:  # fmt: skip
+    """A data set of BVH files in an archive or folder."""
 
     def read(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
-        for name, content in members(path, (".bvh",), progress):
-            if PurePosixPath(name).parent.name == NORMALISED:
-                yield Dropped(name, source, "of unknown speed", "stretched to 240 frames, whatever it lasted")
+        for file, content in members(path, (".bvh",), progress):
+            if PurePosixPath(file).parent.name == NORMALISED:
+                yield Dropped(file, name, "of unknown speed", "stretched to 240 frames, whatever it lasted")
                 continue
             try:
                 bvh, skeleton, positions = bvh_motion(content.decode("ascii", "replace"))
             except MotionError as error:
-                yield Dropped(name, source, UNREADABLE, str(error))
+                yield Dropped(file, name, UNREADABLE, str(error))
                 continue
-            origin = origin_of(name, bvh)
+            origin = origin_of(file, bvh)
             if origin.name in REPEATS:
-                yield _repeat(origin.name, source)
+                yield _repeat(origin.name, name)
                 continue
-            yield Clip(origin.name, source, licence, origin.subject, origin.action, bvh.fps, skeleton, positions)
+            yield Clip(origin.name, name, licence, origin.subject, origin.action, bvh.fps, skeleton, positions)
 
-    return read
+    return DataSet(name, files, weights, read, split)
 
 
 def _origin_cmu(name: str, _bvh: Bvh) -> _Origin:
@@ -284,46 +252,37 @@ DATA_SETS: tuple[DataSet, ...] = (
         "CMU (AMC)", r"cmu_amc\b.*", "default", _read_cmu_amc,
         lambda clip: _held_out(clip.subject in CMU_VALIDATION),
     ),
-    DataSet(
-        "CMU (BVH)", r"cmu_bvh\b.*", "default", _bvh_reader("CMU (BVH)", CMU_LICENCE, _origin_cmu),
-        lambda _: "train",
-    ),
+    _bvh("CMU (BVH)", r"cmu_bvh\b.*", "default", CMU_LICENCE, _origin_cmu, lambda _: "train"),
     DataSet("CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap, lambda _: "train"),
-    DataSet(
-        "CMU (more)", r"cmu_more\b.*", "default", _bvh_reader("CMU (more)", CMU_LICENCE, _origin_cmu_more),
-        lambda _: "train",
-    ),
-    DataSet(
-        "CMU (dance)", r"cmu_dance\b.*", "default", _bvh_reader("CMU (dance)", CMU_LICENCE, _origin_kind),
+    _bvh("CMU (more)", r"cmu_more\b.*", "default", CMU_LICENCE, _origin_cmu_more, lambda _: "train"),
+    _bvh(
+        "CMU (dance)", r"cmu_dance\b.*", "default", CMU_LICENCE, _origin_kind,
         lambda clip: "train" if clip.subject in DANCE_TRAINING else "test",
     ),
-    DataSet(
-        "ReActIdle", r"reactidle\b.*", "default", _bvh_reader("ReActIdle", "MIT", _origin_reactidle),
+    _bvh(
+        "ReActIdle", r"reactidle\b.*", "default", "MIT", _origin_reactidle,
         lambda clip: _held_out(clip.subject in REACTIDLE_VALIDATION),
     ),
     DataSet(
         "UI-PRMD (Vicon)", r"ui_prmd\b.*", "default", _read_ui_prmd,
         lambda clip: _held_out(clip.subject in VALIDATION_SUBJECTS),
     ),
-    DataSet(
-        "Bandai-Namco", r"bandai_\d\b.*", "research", _bvh_reader("Bandai-Namco", "CC-BY-NC-4.0", _origin_bandai),
+    _bvh(
+        "Bandai-Namco", r"bandai_\d\b.*", "research", "CC-BY-NC-4.0", _origin_bandai,
         lambda clip: _held_out(clip.subject == BANDAI_VALIDATION),
     ),
     DataSet(
         "AMASS", r"amass\b.*", "research", _read_amass,
         lambda clip: _held_out(not AMASS_VALIDATION.isdisjoint(PurePosixPath(clip.name).parts)),
     ),
-    DataSet(
-        "DanceDB", r"dancedb\b.*", "measure", _bvh_reader("DanceDB", "DanceDB: research", _origin_dancedb),
+    _bvh(
+        "DanceDB", r"dancedb\b.*", "measure", "DanceDB: research", _origin_dancedb,
         lambda clip: "val" if clip.subject in DANCEDB_VALIDATION else "test",
     ),
-    DataSet(
-        "LAFAN1", r"lafan1\b.*", "measure", _bvh_reader("LAFAN1", "CC-BY-NC-ND-4.0", _origin_lafan1),
+    _bvh(
+        "LAFAN1", r"lafan1\b.*", "measure", "CC-BY-NC-ND-4.0", _origin_lafan1,
         lambda clip: "val" if clip.subject == LAFAN1_VALIDATION else "test",
     ),
-    DataSet(
-        "own", r"own\b.*", "default", read_own,
-        _own_split,
-    ),
+    DataSet("own", r"own\b.*", "default", read_own, _own_split),
 )  # fmt: skip
 """All data sets, in the order of preparation. A user's own recordings in a folder ``own`` train the default set."""

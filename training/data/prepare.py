@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,9 +268,23 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
         "speed": np.array([p.speed for p in prepared]),
         **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
     }
-    partial = path.with_name(f"{path.stem}.partial.npz")
-    np.savez(partial, **arrays)
-    os.replace(partial, path)
+    save_arrays(path, **arrays)
 
 
 _TEXTS = ("name", "source", "licence", "subject", "action")
+
+
+def save_arrays(path: Path, **arrays: NDArray[Any]) -> None:
+    """Write an ``.npz`` atomically."""
+    part = path.with_suffix(".part.npz")
+    np.savez(part, **arrays)  # type: ignore[arg-type]
+    part.replace(path)
+
+
+def made_once(path: Path, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an ``.npz``, which are made and written if it is not there."""
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_arrays(path, **make())
+    with np.load(path) as arrays:
+        return dict(arrays)

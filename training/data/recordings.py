@@ -17,7 +17,7 @@ from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.datasets import DATA_SETS, DataSet, Split
-from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample, runs
+from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample, runs, save_arrays
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
@@ -74,14 +74,19 @@ class Pairs:
         return Pairs(self.seen[rows], self.truth[rows], start, self.subject[clips])
 
 
-def write_arrays(mocap: Path, out: Path) -> None:
+def write_arrays(mocap: Path, out: Path) -> Path:
     """Read the recordings under ``mocap`` that are licensed for products; write ``motion-SPLIT.npz`` and ``pairs.npz``.
 
-    Recordings of the test split are excluded.
+    Recordings of the test split are excluded. Arrays that are there are kept.
+
+    Returns:
+        ``out``.
 
     Raises:
         MotionError: there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
     """
+    if (out / "pairs.npz").is_file():
+        return out
     found: dict[str, list[tuple[str, float, NDArray[np.float32]]]] = {"train": [], "val": []}
     for data in DATA_SETS:
         if data.name not in _FREE:
@@ -106,7 +111,9 @@ def write_arrays(mocap: Path, out: Path) -> None:
             source=np.array([source for source, _, _ in clips]),
             speed=np.array([speed for _, speed, _ in clips]),
         )
-    _write_pairs(mocap / "ui_prmd.npz", out / "pairs.npz")
+    # the last: its existence means that all arrays are written
+    save_arrays(out / "pairs.npz", **vars(_pairs(mocap / "ui_prmd.npz")))
+    return out
 
 
 def _split(clip: Clip, data: DataSet) -> Split:
@@ -120,16 +127,16 @@ def _split(clip: Clip, data: DataSet) -> Split:
     return "train" if data.name == "CMU (expmap)" else data.split(clip)
 
 
-def load_motion(path: Path) -> Motion:
-    """Read ``motion-SPLIT.npz``."""
-    with np.load(path) as data:
-        return Motion(data["positions"], data["start"], data["source"], data["speed"])
+def load_motion(arrays: Path, split: str) -> Motion:
+    """Read the motion of a split from the folder of `write_arrays`."""
+    with np.load(arrays / f"motion-{split}.npz") as data:
+        return Motion(**data)
 
 
-def load_kinect(path: Path) -> Pairs:
-    """Read ``pairs.npz``."""
-    with np.load(path) as data:
-        return Pairs(data["seen"], data["truth"], data["start"], data["subject"])
+def load_kinect(arrays: Path, split: str) -> Pairs:
+    """Read the pairs of the training subjects or of the validation subjects, likewise."""
+    with np.load(arrays / "pairs.npz") as data:
+        return Pairs(**data).of(TRAIN_SUBJECTS if split == "train" else VALIDATION_SUBJECTS)
 
 
 def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, NDArray[np.float32]]]:
@@ -151,10 +158,9 @@ def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, N
                     yield speed, fast[a:b].astype(np.float32)
 
 
-def _write_pairs(path: Path, out: Path) -> None:
-    subjects = (*TRAIN_SUBJECTS, *VALIDATION_SUBJECTS)
+def _pairs(path: Path) -> Pairs:
     seen, truth, names = [], [], []
-    for subject in subjects:
+    for subject in (*TRAIN_SUBJECTS, *VALIDATION_SUBJECTS):
         clips = [pair for pair in load_pairs(path, [subject]) if pair.fps == FPS and len(pair.kinect) >= FPS]
         aligned = []
         for pair in clips:
@@ -171,15 +177,8 @@ def _write_pairs(path: Path, out: Path) -> None:
             seen.append(kinect.astype(np.float32))
             truth.append((pair.vicon + np.einsum("tab,jb->tja", frame, offset)).astype(np.float32))
             names.append(subject)
-    part = out.with_suffix(".part.npz")
-    np.savez(
-        part,
-        seen=np.concatenate(seen),
-        truth=np.concatenate(truth),
-        start=np.concatenate([[0], np.cumsum([len(s) for s in seen])]),
-        subject=np.array(names),
-    )
-    part.replace(out)  # atomic: its existence means that all arrays are written
+    start = np.concatenate([[0], np.cumsum([len(s) for s in seen])])
+    return Pairs(np.concatenate(seen), np.concatenate(truth), start, np.array(names))
 
 
 def trunk_frame(positions: Floats) -> Floats:

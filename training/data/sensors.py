@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.corruption import ABSENT, occlude
-from steadypose.training.data.recordings import Motion, Pairs
+from steadypose.training.data.recordings import Motion, Pairs, load_kinect, load_motion
 
 Rng = np.random.Generator
 
@@ -32,17 +33,13 @@ CARRIED = 0.15
 """Share of clips from a moving camera with unknown pose, such as a robot's or one that is bumped into."""
 
 _SWINGS = (
-    ("elbow", ("wrist",)),
-    ("shoulder", ("elbow", "wrist")),
-    ("knee", ("ankle", "foot")),
-    ("hip", ("knee", "ankle", "foot")),
+    ("elbow", "wrist"),
+    ("shoulder", "elbow", "wrist"),
+    ("knee", "ankle", "foot"),
+    ("hip", "knee", "ankle", "foot"),
 )
 _HIPS = [J["left_hip"], J["right_hip"]]
-_LIMBS = [
-    [J[f"{side}_{n}"] for n in names]
-    for side in ("left", "right")
-    for names in (("elbow", "wrist"), ("knee", "ankle", "foot"))
-]
+_LIMBS = [[J[f"{side}_{n}"] for n in names] for side in ("left", "right") for names in (_SWINGS[0], _SWINGS[2])]
 
 
 @dataclass(frozen=True)
@@ -54,13 +51,11 @@ class Sensed:
         truth: (C, T, 22, 3) metres, NaN where unknown.
         confidence: (C, T, 22) 0 to 1, the sensor's confidence; in 70 % of clips, the noise is inversely proportional to
             it.
-        kind: (C,) index into `KINDS`.
     """
 
     seen: Floats
     truth: Floats
     confidence: Floats
-    kind: NDArray[np.int64]
 
 
 class Sensors:
@@ -69,17 +64,21 @@ class Sensors:
     def __init__(self, motion: Motion, pairs: Pairs, frames: int) -> None:
         """``frames`` is the length of a clip; ``pairs`` are recordings of the training subjects."""
         self._motion, self._pairs, self._frames = motion, pairs, frames
-        sources = sorted(set(motion.source))
         room = np.maximum(np.diff(motion.start) - frames, 0).astype(float)
         # sources are weighted by their length to the power of 0.4: dance is short and fast
         weight = np.zeros(len(room))
-        for source in sources:
+        for source in sorted(set(motion.source)):
             own = motion.source == source
             if room[own].sum() > 0:
                 weight[own] = room[own] / room[own].sum() ** 0.6
         self._weight = weight / weight.sum()
         lengths = np.diff(pairs.start) * sound(pairs)
         self._pair_weight = np.maximum(lengths - 20, 0) / np.maximum(lengths - 20, 0).sum()
+
+    @classmethod
+    def of(cls, arrays: Path, split: str, frames: int) -> Sensors:
+        """Of the motion and pairs of a split in the folder of `recordings.write_arrays`."""
+        return cls(load_motion(arrays, split), load_kinect(arrays, split), frames)
 
     def draw(self, count: int, rng: Rng) -> Sensed:
         """Draw ``count`` clips."""
@@ -101,7 +100,7 @@ class Sensors:
             places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
         for clip in np.flatnonzero(rng.random(count) < TURNED):
             _turn(seen[clip], truth[clip], rng)
-        return Sensed(seen, truth, confidence, kind)
+        return Sensed(seen, truth, confidence)
 
     def _true(self, count: int, rng: Rng) -> Floats:
         start = self._motion.start
@@ -183,10 +182,8 @@ class Sensors:
         first = start[clip] + int(rng.random() * max(start[clip + 1] - start[clip] - self._frames, 0))
         rows = slice(first, min(first + self._frames, start[clip + 1]))
         seen, truth = np.full((2, self._frames, 22, 3), np.nan)
-        seen[: rows.stop - rows.start], truth[: rows.stop - rows.start] = (
-            self._pairs.seen[rows],
-            self._pairs.truth[rows],
-        )
+        there = slice(rows.stop - rows.start)
+        seen[there], truth[there] = self._pairs.seen[rows], self._pairs.truth[rows]
         if rng.random() < 0.5:
             seen, truth = (x[:, MIRROR] * (1.0, -1.0, 1.0) for x in (seen, truth))
         return seen, truth
@@ -321,9 +318,9 @@ def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
 
 def _swing(truth: Floats, rng: Rng) -> None:
     """Make a limb swing, in place: 0.5 to 4.5 Hz, amplitude up to 0.7 rad."""
-    centre, moved = _SWINGS[rng.integers(len(_SWINGS))]
+    limb = _SWINGS[rng.integers(len(_SWINGS))]
     side = rng.choice(["left", "right"])
-    pivot, joints = J[f"{side}_{centre}"], [J[f"{side}_{n}"] for n in moved]
+    pivot, *joints = (J[f"{side}_{n}"] for n in limb)
     frequency, phase = rng.uniform(0.5, 4.5), rng.uniform(0, 2 * np.pi)
     angle = rng.uniform(0.1, 0.7) * np.sin(phase + 2 * np.pi * frequency * np.arange(len(truth)) / FPS)
     axis = rng.standard_normal(3)

@@ -16,7 +16,6 @@ fluctuating weights would add noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -120,38 +119,19 @@ class MixtureNet(nn.Module):
 
         ``present`` (C, T) says whether there is a body.
         """
-        written, gates = self.layers(
-            features, lambda own: self.own_memory(own, present), lambda body: self.body_memory(body, present)
-        )
-        kept = kept_of(gates, F.pad(present[:, :-1], (1, 0))[..., None, None])
-        return _faded(kept, (1.0 - kept) * written)
-
-    def layers(
-        self, features: Tensor, own_memory: Callable[[Tensor], Tensor], body_memory: Callable[[Tensor], Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """Return new outputs (..., 22, OUTPUTS) before gating, and their gates (..., 22, GATES).
-
-        Args:
-            features: (..., 22, FEATURES) input features.
-            own_memory: maps joints' features (..., 22, own) to their running means.
-            body_memory: maps bodies' features (..., body) to their running means.
-        """
         normalised = (features - self.mean) / self.deviation
         own = F.relu(self.read(normalised) + self.joint)
-        before = own_memory(own)
+        before = self.own_memory(own, present)
         body = F.relu(self.gather(own.flatten(-2)))
-        body = body + F.relu(self.remember(body_memory(body)))
+        body = body + F.relu(self.remember(self.body_memory(body, present)))
         body = body + F.relu(self.think(body))
         context = self.tell(body).unflatten(-1, (JOINTS, self.config.told))
         mixed = F.relu(self.mix(torch.cat([normalised, before, context], dim=-1)) + self.joint_mix)
         written, gates = self.write(mixed + F.relu(self.deepen(mixed))).split([OUTPUTS, GATES], dim=-1)
-        return written, gates
-
-
-def kept_of(gates: Tensor, before: Tensor) -> Tensor:
-    """Weight (..., 22, OUTPUTS) of the previous frame's outputs; 0 if there is no frame ``before``."""
-    kept = torch.where(before, torch.sigmoid(gates), 0.0)
-    return kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
+        continued = F.pad(present[:, :-1], (1, 0))[..., None, None]
+        kept = torch.where(continued, torch.sigmoid(gates), 0.0)
+        kept = kept.repeat_interleave(torch.tensor([2 * EXPERTS, 3, 1]), dim=-1)
+        return _faded(kept, (1.0 - kept) * written)
 
 
 def answer(

@@ -12,7 +12,7 @@ between key frames, parts of the body, and combinations of these. In some window
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -153,6 +153,7 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
     return recipe.train(options, described, data, calibrated=lambda model: calibrate(model, val))
 
 
+@dataclass(frozen=True)
 class Truth:
     """Windows of true motion.
 
@@ -162,8 +163,9 @@ class Truth:
         offsets: (B, 22, 3) metres, bones.
     """
 
-    def __init__(self, rotations: Tensor, root: Tensor, offsets: Tensor) -> None:
-        self.rotations, self.root, self.offsets = rotations, root, offsets
+    rotations: Tensor
+    root: Tensor
+    offsets: Tensor
 
     @classmethod
     def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:

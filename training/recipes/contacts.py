@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet, describe_data
+from steadypose.training.data.prepare import made_once
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 OUTPUTS = 2 * len(CONTACT_JOINTS)
@@ -47,11 +49,6 @@ class ContactConfig:
 
     hidden: int = 64
 
-    @classmethod
-    def from_dict(cls, config: dict[str, Any]) -> ContactConfig:
-        """From the JSON of a weights file."""
-        return cls(**config)
-
 
 class ContactNet(nn.Module):
     """A gated recurrent unit (Cho et al. 2014) and a linear layer."""
@@ -64,21 +61,8 @@ class ContactNet(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Logits of load and of rest, (B, T, 8) each, of features (B, T, FEATURES) from a body's first frame on."""
-        logits = self.head(self.unit(features)[0])
-        load, rest = logits.chunk(2, dim=-1)
+        load, rest = self.head(self.unit(features)[0]).chunk(2, dim=-1)
         return load, rest
-
-    def step(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits (B, 8) of load and of rest of one frame's features (B, FEATURES), and the state (B, hidden) after it;
-        before the first frame it is 0."""
-        of_input, of_state, input_bias, state_bias = self.unit.all_weights[0]
-        reset_in, update_in, new_in = F.linear(features, of_input, input_bias).chunk(3, dim=-1)
-        reset_kept, update_kept, new_kept = F.linear(state, of_state, state_bias).chunk(3, dim=-1)
-        reset, update = torch.sigmoid(reset_in + reset_kept), torch.sigmoid(update_in + update_kept)
-        new = torch.tanh(new_in + reset * new_kept)
-        state = new + update * (state - new)
-        load, rest = self.head(state).chunk(2, dim=-1)
-        return load, rest, state
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
@@ -240,21 +224,15 @@ def train_contacts(options: TrainingOptions) -> Path:
     )  # fmt: skip
     described = (
         f"load and rest of {len(CONTACT_JOINTS)} joints, a recurrent network, on {CLIPS['train']} clips through "
+        "simulated sensors and the smoother"
     )
-    described += "simulated sensors and the smoother"
     return recipe.train(options, described, describe_data(options.weights, *motion.values()))
 
 
 def _pool(directory: Path, motion: MotionSet, split: str, seed: int) -> Pool:
     """Return the smoothed clips of a split, computed once."""
-    path = directory / f"clips-{split}.npz"
-    if not path.is_file():
-        directory.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part.npz")
-        np.savez(part, **vars(smoothed_clips(motion, CLIPS[split], seed + (split == "val"))))
-        part.replace(path)
-    with np.load(path) as arrays:
-        return Pool(**arrays)
+    make = partial(smoothed_clips, motion, CLIPS[split], seed + (split == "val"))
+    return Pool(**made_once(directory / f"clips-{split}.npz", lambda: vars(make())))
 
 
 def evaluate_contacts(model: ContactNet, pool: Pool) -> dict[str, float]:

@@ -59,9 +59,6 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[Comp
         model: an HG-VAE with a completion network; its ``mean`` is set.
         train: training motion.
         val: motion of other people, for the validation curves.
-
-    Raises:
-        ValueError: the model has no completion network.
     """
     network = _network(model)
 
@@ -82,18 +79,8 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[Comp
 
 
 def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, bias_sigma: Floats | float) -> tuple[Tensor, ...]:
-    """Errors of completed windows, their stated log-variance, both in units of `SCALE`, and which entries count.
-
-    Args:
-        model: with a completion network.
-        seen: (B, T, 22, 3) metres, NaN where hidden.
-        truth: (B, T, 22, 3) metres.
-        sizes: (B,) of the bodies.
-        bias_sigma: (B,) metres along an axis, of the sensor's bias.
-
-    Returns:
-        Three times (B, 66, T): error, log-variance, and whether an entry was hidden since the body's first observation.
-    """
+    """Return errors (B, 66, T) of completed windows (B, T, 22, 3), their predicted log-variance, both in units of
+    `SCALE`, and which entries were hidden since the body's first observation."""
     batch = Batch.of(model, seen, truth, sizes)
     completed, log_var = _network(model).complete(batch.x, batch.observed, bias_sigma)
     off = completed - batch.target
@@ -101,8 +88,7 @@ def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, bias_sigma
 
 
 def _network(model: HGVAE) -> CompletionNet:
-    if model.completion is None:
-        raise ValueError("expected a model with a completion network")
+    assert model.completion is not None, "expected a model with a completion network"
     return model.completion
 
 

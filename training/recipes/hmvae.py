@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import roma
@@ -17,7 +16,7 @@ from torch.optim.lr_scheduler import LRScheduler, MultiStepLR
 
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import limbs
-from steadypose.prior.fit.hmvae_network import HMVAE, MotionVAE
+from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, remove_heading, to_6d
 from steadypose.prior.models.hmvae import HMVAEConfig
 from steadypose.training.data.dataset import (
@@ -29,13 +28,10 @@ from steadypose.training.data.dataset import (
 )
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
-VAE = TypeVar("VAE", bound=MotionVAE)
-
-JOINT_WEIGHT = 10.0
-"""Weight lambda of equation 5."""
-
-KL_WEIGHT = 0.003
-"""Weight beta of equation 3; it matches `Posterior.kl`'s reduction and losses that are means."""
+KL_WEIGHT = 1e-5
+"""Weight beta of equation 3; it matches `Posterior.kl`'s reduction and losses that are means. Deviations from a mean
+pose are small, so with the paper's beta (0.003), the KL divergence outweighs the latents' gain and they collapse to the
+prior."""
 
 GLOBAL_FIRST = 0.08
 """Share of the training in which z_l is detached, so that z_g is used (official: 20,000 of 250,000 steps)."""
@@ -45,20 +41,13 @@ LOCAL_WARM_UP = 0.4
 prior and the reconstruction error rises by a tenth, because the decoder has learnt to ignore z_l
 (benchmarks/NOTEBOOK.md)."""
 
-# The paper varies the frame rate. Prepared motion has 30 Hz, so its halves and thirds are available. Half of the
-# windows keep the live node's rate.
-STRIDES = (1, 1, 1, 2, 2, 3)
 TILT_SD = math.radians(3.0)
 
 _LIMBS = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
 
-ABOUT_MEAN_KL_WEIGHT = 1e-5
-"""Weight beta of a model about the mean pose. Its deviations are small, so with the paper's beta, the KL divergence
-outweighs the latents' gain and they collapse to the prior."""
-
 NOISY, NOISE, HELD = 0.5, 0.03, 0.25
-"""Corruption for a model about the mean pose: share of windows with noise; largest standard deviation of the noise
-along an axis, metres, with a random share of bias; and share of these windows with a frozen limb."""
+"""Corruption of the input, whose target is the clean window: share of windows with noise; largest standard deviation of
+the noise along an axis, metres, with a random share of bias; and share of these windows with a frozen limb."""
 
 LONG_CONFIG = HMVAEConfig(window=64, kernel=7, strides=(2, 2, 2, 2), local_latent=24, global_latent=24, about_mean=True)
 """Sizes for windows of 64 frames, used by `prior.fit.optimise`. They are the official sizes, except for half the
@@ -73,37 +62,26 @@ class Hyperparameters:
         iterations: number of optimiser steps.
         batch: windows per step.
         learning_rate: initial learning rate of Adam; it falls to a third twice.
+        joint_weight: lambda of equation 5.
         strides: frame strides of windows; each entry has the same probability.
-        kl_weight: beta.
-        joint_weight: lambda.
-        denoise: whether the input is corrupted by noise and occlusion, with the clean window as the target.
         speed_weighted: whether windows are speed-weighted: fast motion is drawn more often, large sources less.
     """
 
     iterations: int
     batch: int
     learning_rate: float
-    strides: Sequence[int] = STRIDES
-    kl_weight: float = KL_WEIGHT
-    joint_weight: float = JOINT_WEIGHT
-    denoise: bool = False
-    speed_weighted: bool = False
+    joint_weight: float
+    strides: Sequence[int]
+    speed_weighted: bool
 
 
-SHORT = Hyperparameters(1_800, 64, 2e-3, kl_weight=ABOUT_MEAN_KL_WEIGHT, joint_weight=200.0, denoise=True)
+# The paper varies the frame rate. Prepared motion has 30 Hz, so its halves and thirds are available. Half of the
+# windows keep the live node's rate.
+SHORT = Hyperparameters(1_800, 64, 2e-3, 200.0, strides=(1, 1, 1, 2, 2, 3), speed_weighted=False)
 """Hyperparameters with the official schedule (250,000 steps of 8 windows at 1e-4) condensed into fewer, larger steps.
 The proportions are kept: z_l enters late, and the learning rate falls twice."""
 
-LONG = Hyperparameters(
-    12_000,
-    16,
-    1e-3,
-    strides=(1, 1, 2, 3),
-    kl_weight=ABOUT_MEAN_KL_WEIGHT,
-    joint_weight=100.0,
-    denoise=True,
-    speed_weighted=True,
-)
+LONG = Hyperparameters(12_000, 16, 1e-3, 100.0, strides=(1, 1, 2, 3), speed_weighted=True)
 
 
 def train_hmvae(options: TrainingOptions) -> Path:
@@ -118,29 +96,28 @@ def train_long_hmvae(options: TrainingOptions) -> Path:
 
 def _train(name: str, config: HMVAEConfig, described: str, used: Hyperparameters, options: TrainingOptions) -> Path:
     train, val = options.motion()
-    recipe = recipe_of(name, lambda: HMVAE(config), train, val, used)
     described = f"HM-VAE, {described}, 22 joints (prior/fit/hmvae_network.py)"
-    return recipe.train(options, described, describe_data(options.weights, train, val))
+    return recipe_of(name, config, train, val, used).train(
+        options, described, describe_data(options.weights, train, val)
+    )
 
 
-def recipe_of(
-    name: str, network: Callable[[], VAE], train: MotionSet, val: MotionSet, used: Hyperparameters
-) -> Recipe[VAE]:
-    """Return the recipe of a VAE of windows, trained like HM-VAE with equations 3 and 5 to 8."""
+def recipe_of(name: str, config: HMVAEConfig, train: MotionSet, val: MotionSet, used: Hyperparameters) -> Recipe[HMVAE]:
+    """Return the recipe of a VAE of windows, with equations 3 and 5 to 8."""
     windows = SpeedWeightedWindows(train) if used.speed_weighted else train
 
-    def loss_of(model: VAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
+    def loss_of(model: HMVAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         rows = windows.sample(count, model.window, used.strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        seen = corrupt(rotations, offsets, rng) if used.denoise else rotations
-        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, used)
+        seen = corrupt(rotations, offsets, rng)
+        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, used.joint_weight)
 
     def falls_twice(optimiser: Optimizer, steps: int) -> LRScheduler:
         return MultiStepLR(optimiser, [int(steps * share) for share in (0.6, 0.85)], gamma=0.3)
 
     return Recipe(
-        name, network, loss_of, lambda model: evaluate_hmvae(model, val), used.iterations, used.batch,
+        name, lambda: HMVAE(config), loss_of, lambda model: evaluate_hmvae(model, val), used.iterations, used.batch,
         used.learning_rate, decay=1e-4, optimiser=Adam, schedule=falls_twice, evaluations=24,
     )  # fmt: skip
 
@@ -187,7 +164,7 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = 
 
 
 def _loss(
-    model: MotionVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, used: Hyperparameters
+    model: HMVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, joint_weight: float
 ) -> tuple[Tensor, dict[str, float]]:
     """Equations 3 and 5 to 8, each term a mean. ``local_weight`` is z_l's share of beta; below 0, z_l is detached."""
     x = to_6d(rotations)
@@ -204,14 +181,14 @@ def _loss(
     l_rot = (matrices - rotations).square().mean()
     l_joints = (joints[0] - joints[1]).square().mean()
     kl = global_kl + min(max(local_weight, 0.0), 1.0) * local_kl
-    loss = l_6d + l_rot + used.joint_weight * l_joints + used.kl_weight * kl
+    loss = l_6d + l_rot + joint_weight * l_joints + KL_WEIGHT * kl
     return loss, {
         "loss": loss.item(), "L_6d": l_6d.item(), "KL local": local_kl.item(), "KL global": global_kl.item(),
     }  # fmt: skip
 
 
 @torch.no_grad()
-def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) -> dict[str, float]:
+def evaluate_hmvae(model: HMVAE, motion: MotionSet, frames: int = 16_384) -> dict[str, float]:
     """Evaluate the reconstruction from the posterior's mean on unseen people.
 
     Returns:
@@ -231,7 +208,7 @@ def evaluate_hmvae(model: MotionVAE, motion: MotionSet, frames: int = 16_384) ->
     }  # fmt: skip
 
 
-def _noise_left(model: MotionVAE, rotations: Tensor, offsets: Tensor) -> float:
+def _noise_left(model: HMVAE, rotations: Tensor, offsets: Tensor) -> float:
     """Return the decoded joints' error in windows with 2 cm of noise, relative to the error before decoding."""
     noisy = corrupt(rotations, offsets, np.random.default_rng(0), noise=0.02)
     decoded = from_6d(model.reconstruct(to_6d(noisy)))

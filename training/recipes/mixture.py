@@ -18,21 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
-from steadypose.prior.models.mixture.bank import (
-    DENSITIES,
-    EXPERTS,
-    MEASUREMENT_SIGMA,
-    advance,
-    new_bank,
-)
+from steadypose.prior.models.mixture.bank import DENSITIES, EXPERTS, MEASUREMENT_SIGMA, advance, new_bank
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
 from steadypose.prior.models.weights import LICENCES
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
+from steadypose.training.data.recordings import write_arrays
 from steadypose.training.data.sensors import Sensed, Sensors
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
 
@@ -195,12 +188,8 @@ def train_mixture(options: TrainingOptions) -> Path:
     Prepared arrays, at several speeds, are kept in the run's folder. With ``options.start``, the learning rate is
     halved.
     """
-    arrays = options.path("mixture").parent / "arrays"
-    if not (arrays / "pairs.npz").is_file():
-        write_arrays(options.data, arrays)
-    pairs = load_kinect(arrays / "pairs.npz")
-    sensors = Sensors(load_motion(arrays / "motion-train.npz"), pairs.of(TRAIN_SUBJECTS), FRAMES)
-    val = Sensors(load_motion(arrays / "motion-val.npz"), pairs.of(("s07", "s08")), FRAMES)
+    arrays = write_arrays(options.data, options.path("mixture").parent / "arrays")
+    sensors, val = (Sensors.of(arrays, split, FRAMES) for split in ("train", "val"))
     watched = [(delay, through_bank(val.draw(40, np.random.default_rng((1, delay))), delay)) for delay in (0, 4)]
     recent = {"loss": 0.0}
 

@@ -22,7 +22,7 @@ from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.recordings import Motion, load_motion, write_arrays
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.weights import save_weights
+from steadypose.training.weights import save_weights, write_card
 
 FRAMES = 150_000
 """Number of bodies; sources are weighted by the square root of their length, because dance is short and different."""
@@ -99,18 +99,13 @@ def covariance_of(motion: Motion) -> NDArray[np.float64]:
 def train_modes(options: TrainingOptions) -> Path:
     """Compute it from recordings in ``options.data`` that are licensed for products; returns the weights' path."""
     path = options.path("body_modes")
-    arrays = options.path("mixture").parent / "arrays"
-    if not (arrays / "pairs.npz").is_file():
-        write_arrays(options.data, arrays)
-    motion = load_motion(arrays / "motion-train.npz")
+    motion = load_motion(write_arrays(options.data, options.path("mixture").parent / "arrays"), "train")
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file({"covariance": covariance_of(motion).astype(np.float32)}, path, metadata={"config": json.dumps({})})
-    card = {
+    write_card(path, {
         "Model": "covariance of joints' accelerations along an axis, relative to their mean variance (22, 22)",
         "Data": f"{', '.join(sorted(set(motion.source)))}: people of the training split, each source counting the same",
         "Licence": LICENCES["default"],
         "Training": "`steadypose train body_modes --data MOCAP`, seconds; nothing is drawn at random",
-    }
-    lines = [f"# {path.stem}", "", *(f"- **{heading}**: {content}" for heading, content in card.items())]
-    path.with_suffix(".md").write_text("\n".join(lines) + "\n")
+    })  # fmt: skip
     return path

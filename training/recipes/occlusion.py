@@ -30,9 +30,9 @@ from steadypose.prior.models.occlusion.candidates import CANDIDATES, FEATURES
 from steadypose.prior.models.occlusion.inference import MAX_LOG_SIGMA, MIN_LOG_SIGMA, Occluded, Weighed
 from steadypose.prior.sim.camera import segment_gap
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.recordings import load_kinect, load_motion, write_arrays
+from steadypose.training.data.prepare import made_once
+from steadypose.training.data.recordings import write_arrays
 from steadypose.training.data.sensors import Sensors
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 FIRST_LOG_SIGMA = 4.0
@@ -87,11 +87,6 @@ class OcclusionConfig:
     """
 
     hidden: int = 96
-
-    @classmethod
-    def from_dict(cls, config: dict[str, Any]) -> OcclusionConfig:
-        """From the JSON of a weights file."""
-        return cls(**config)
 
 
 class OcclusionNet(nn.Module):
@@ -242,10 +237,8 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
     It uses the mixture's recordings that are licensed for products, or its prepared arrays.
     """
-    directory = options.path("occlusion").parent
-    if not (directory / "arrays" / "pairs.npz").is_file():
-        write_arrays(options.data, directory / "arrays")
-    rows = {split: _rows(directory, split, options.seed) for split in RECORDED}
+    arrays = write_arrays(options.data, options.path("occlusion").parent / "arrays")
+    rows = {split: _rows(arrays, split, options.seed) for split in RECORDED}
     train, val = ({key: torch.from_numpy(value) for key, value in vars(rows[split]).items()} for split in RECORDED)
 
     def loss(network: OcclusionNet, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
@@ -273,16 +266,10 @@ def train_occlusion(options: TrainingOptions) -> Path:
     )
 
 
-def _rows(directory: Path, split: str, seed: int) -> Rows:
+def _rows(arrays: Path, split: str, seed: int) -> Rows:
     """Return the rows of a split, recorded once. A recorder replaces the network, so any weights will do."""
-    path = directory / f"rows-{split}.npz"
-    if not path.is_file():
-        pairs = load_kinect(directory / "arrays" / "pairs.npz").of(
-            TRAIN_SUBJECTS if split == "train" else ("s07", "s08")
-        )
-        sensors = Sensors(load_motion(directory / "arrays" / f"motion-{split}.npz"), pairs, FRAMES)
-        part = path.with_suffix(".part.npz")
-        np.savez(part, **vars(record(sensors, PriorSettings(), RECORDED[split], seed, split)))
-        part.replace(path)
-    with np.load(path) as arrays:
-        return Rows(**arrays)
+
+    def make() -> dict[str, NDArray[Any]]:
+        return vars(record(Sensors.of(arrays, split, FRAMES), PriorSettings(), RECORDED[split], seed, split))
+
+    return Rows(**made_once(arrays.parent / f"rows-{split}.npz", make))

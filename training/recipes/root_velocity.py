@@ -203,10 +203,7 @@ def _windows(motion: _Motion, rng: Rng, noise_sd: float | None = None) -> _Windo
 def _corrupt(joints: Tensor, rng: Rng, noise_sd: float | None = None) -> Tensor:
     """Add time-correlated noise (AR(1)) to joints (B, T, 22, 3), including the root, and hold a limb in some windows.
 
-    Args:
-        joints: metres relative to the root.
-        rng: random generator.
-        noise_sd: metres, noise of every window; random up to `NOISE_SD` if omitted.
+    ``noise_sd`` is the noise of every window, metres; random up to `NOISE_SD` if omitted.
     """
     count, time = joints.shape[:2]
     sd = rng.uniform(0.0, NOISE_SD, (count, 1, 1, 1)) if noise_sd is None else np.full((count, 1, 1, 1), noise_sd)
@@ -245,9 +242,9 @@ def _loss(predicted: RootMotion, windows: _Windows) -> tuple[Tensor, dict[str, f
 
 
 @torch.no_grad()
-def _validate(model: TrajectoryNet, motion: MotionSet, length: int, count: int) -> tuple[RootMotion, _Windows]:
-    """Predict about ``count`` windows of ``length`` frames of unseen people with 1 cm of noise."""
-    rows = motion.all_windows(length + 2, step=length)
+def _validate(model: TrajectoryNet, motion: MotionSet, count: int) -> tuple[RootMotion, _Windows]:
+    """Predict about ``count`` windows of unseen people with 1 cm of noise."""
+    rows = motion.all_windows(WINDOW + 2, step=WINDOW)
     rows = rows[:: max(len(rows) // count, 1)]
     inner = rows[:, 1:-1]
     true = _Motion(motion.positions[rows], heading(motion.rotations[inner, 0]), motion.contacts[inner].float())
@@ -262,7 +259,7 @@ def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, fl
         ``val velocity m/s``, the RMS velocity error along an axis; ``val 1 s drift cm``, that of the horizontal
         trajectory after one second.
     """
-    off, in_world = _errors(*_validate(model, motion, WINDOW, count=512))
+    off, in_world = _errors(*_validate(model, motion, count=512))
     drift = in_world[:, :30, :2].sum(dim=1).norm(dim=-1) * FRAME_S * 100
     return {
         "val velocity m/s": float(off.square().mean().sqrt()),
@@ -275,7 +272,7 @@ def calibrate(model: TrajectoryNet, motion: MotionSet) -> TrajectoryConfig:
 
     The position variance after one second is sigma² · correlation_s for errors of size sigma and this correlation time.
     """
-    predicted, windows = _validate(model, motion, WINDOW, count=2048)
+    predicted, windows = _validate(model, motion, count=2048)
     error = _errors(predicted, windows)[0] * torch.exp(-predicted.log_sigma[:, WARM_UP:])
     size = error.square().mean(dim=(0, 1))
     strayed = (error[:, :30].sum(dim=1) * FRAME_S).square().mean(dim=0)

@@ -218,12 +218,7 @@ def _features_and_missing(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return features (T, FEATURES) and corrections (T, 22, 3) of every frame, metres in the trunk's frame.
 
-    Args:
-        observed: (T, 22, 3) metres, z up, from the sensor.
-        truth: (T, 22, 3) metres, from the reference.
-        alignment: rigid transform from the truth to the sensor's frame.
-        camera: (3,) metres, position of the sensor.
-        fps: frames per second.
+    ``alignment`` is the rigid transform from the truth to the sensor's frame.
     """
     smoother = ConstantVelocityFilter(SMOOTHER_DENSITY)
     smoothed = np.stack([smoother.update(frame, t / fps).positions for t, frame in enumerate(observed)])

@@ -164,7 +164,7 @@ def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:
     seen = noisy(truth)
     seen[20:30, :, 5] = np.nan
     clips = seen.swapaxes(0, 1)
-    sensed = Sensed(clips, truth.swapaxes(0, 1), np.ones(clips.shape[:3]), np.zeros(2, dtype=int))
+    sensed = Sensed(clips, truth.swapaxes(0, 1), np.ones(clips.shape[:3]))
     for delay in (0, 4):
         batch = through_bank(sensed, delay)
         with torch.no_grad():
