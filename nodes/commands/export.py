@@ -33,10 +33,11 @@ def export(
     The file holds one body, in the world frame (floor at 0), at the input's frame rate. Bone lengths are constant, the
     rotations are those of 'clean', and the rest pose is a T-pose.
       .bvh   animation programs: centimetres, y up, facing +z
-      .glb   Blender, Unity, Unreal, browsers: animated bones with a skin; metres, y up (extra 'export')
-      .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop (extra 'export')
+      .glb   Blender, Unity, Unreal, browsers: bones with a skin; metres, y up
+      .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop
       .csv   spreadsheets, and steadypose itself: metres, z up, and quaternions xyzw
       .trc   OpenSim: markers at the joints; millimetres, y up
+    .glb and .vrma need the extra 'export'.
 
     Try:
       steadypose clean take.npz clean.npz && steadypose export clean.npz take.bvh
@@ -99,7 +100,7 @@ def retarget(
     people, the robot follows one at a time.
 
     Try:
-      steadypose retarget sim_data/walk_turn walk.csv --urdf launch/robots/humanoid29.urdf
+      steadypose retarget walk_turn walk.csv --urdf launch/robots/humanoid29.urdf
 
     Args:
         source: a recording, .csv or .npz, as for `steadypose clean`.

@@ -41,16 +41,16 @@ def prepare(
     never trained on.
 
     Data sets are recognised by the name of the archive (.tar.xz, .npz) or folder:
-      cmu_amc, cmu_bvh, cmu_expmap   CMU Graphics Lab, free for all uses            default
-      cmu_more                       the same, some fifteen more people             default
-      cmu_dance                      the same: salsa; martial arts and dance test   default
-      reactidle                      ReActIdle, MIT                                 default
-      ui_prmd                        UI-PRMD, the Vicon's joints, public domain     default
-      bandai_1, bandai_2             Bandai-Namco, CC BY-NC                         research
-      amass                          AMASS' .npz, non-commercial                    research
-      dancedb                        five dancers, research only                    measure
-      lafan1                         four actors, CC BY-NC-ND                       measure
-      own, or any other name         your own; folders 'val', 'test' hold out       default
+      cmu_amc, _bvh, _expmap  CMU Graphics Lab, free for all uses         default
+      cmu_more                the same, some fifteen more people          default
+      cmu_dance               the same: salsa; test: martial arts, dance  default
+      reactidle               ReActIdle, MIT                              default
+      ui_prmd                 UI-PRMD, the Vicon's joints, public domain  default
+      bandai_1, bandai_2      Bandai-Namco, CC BY-NC                      research
+      amass                   AMASS' .npz, non-commercial                 research
+      dancedb                 five dancers, research only                 measure
+      lafan1                  four actors, CC BY-NC-ND                    measure
+      own, or any other name  your own; folders 'val', 'test' hold out    default
 
     Your own files may be .bvh of any rig, .trc, .c3d (extra 'mocap'), AMASS .npz, or .npy arrays with --rig. Joints,
     units and the up axis are recognised. Use one folder per person.
