@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 
@@ -108,10 +108,10 @@ def write_npz(path: Path, positions: np.ndarray, **more: object) -> Path:
     return path
 
 
-def record(directory: Path, messages: list[PoseRaw]) -> Path:
+def record(directory: Path, messages: Sequence[PoseRaw | PoseClean], topic: str = POSE_RAW) -> Path:
     with RecordingWriter(directory) as writer:
         for message in messages:
-            writer.write(POSE_RAW, message, message.stamp_ns)
+            writer.write(topic, message, message.stamp_ns)
     return directory
 
 

@@ -155,10 +155,6 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: frame_by_frame(j, 1e3 * seconds()),
         "they seem to be milliseconds, converted as if they were seconds",
     ),
-    "ten times the rate": (
-        lambda j: steadypose.clean(j, fps=300),
-        r"frames 3\.33 ms apart: .* set fps to the rate at which the recording was made",
-    ),
     "shorter than the delay": (
         lambda j: steadypose.clean(j[:4], fps=30),
         "lasts 0.10 s, less than the delay of 4 frames",
@@ -170,11 +166,6 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     "no such file": (["clean", "nowhere.npz", "out.npz"], {}, "nowhere.npz does not exist: expected"),
     "no such folder": (["clean", "in.csv", "nowhere/out.npz"], {"in.csv": ""}, "to exist; make it first"),
     "an empty CSV": (["clean", "in.csv", "out.npz"], {"in.csv": "\n"}, "in.csv: has no rows: expected a header"),
-    "a CSV with nothing but a header": (
-        ["clean", "in.csv", "out.npz"],
-        {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n"},
-        "has a header, but no rows: expected one for each frame",
-    ),
     "a CSV without a header": (
         ["clean", "in.csv", "out.npz"],
         {"in.csv": "0.0, 1.0, 2.0, 3.0\n"},

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from conftest import record
 from tests.helpers.synthetic_poses import START_NS, messages
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import JointState, PoseClean
 from steadypose.nodes.commands.plot import plot
@@ -43,13 +43,6 @@ def video(tmp_path: Path) -> Path:
     return path
 
 
-def record(path: Path, cleaned: list[PoseClean]) -> Path:
-    with RecordingWriter(path) as writer:
-        for message in cleaned:
-            writer.write(POSE_CLEAN, message, message.stamp_ns)
-    return path
-
-
 def images(path: Path) -> list[np.ndarray]:
     capture, found = cv2.VideoCapture(str(path)), []
     while (read := capture.read())[0]:
@@ -72,7 +65,7 @@ def drawn(image: np.ndarray, at: np.ndarray) -> bool:
 def test_raw_and_clean_stand_side_by_side_where_the_camera_saw_them(
     tmp_path: Path, cleaned: list[PoseClean], video: Path
 ) -> None:
-    plot(record(tmp_path / "bag", cleaned), video=tmp_path / "out.mp4", over=video)
+    plot(record(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     written = images(tmp_path / "out.mp4")
     assert len(written) == FRAMES / 2, "15 a second"
     last = written[-1]
@@ -92,10 +85,10 @@ def test_raw_and_clean_stand_side_by_side_where_the_camera_saw_them(
 def test_what_was_not_observed_is_faint(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     hidden = [J["left_knee"], J["left_ankle"], J["left_foot"]]
     solid = tmp_path / "solid"
-    plot(record(solid, cleaned), video=tmp_path / "solid.mp4", over=video)
+    plot(record(solid, cleaned, POSE_CLEAN), video=tmp_path / "solid.mp4", over=video)
     for message in cleaned:
         message.bodies[0].state[hidden] = JointState.IMPUTED
-    plot(record(tmp_path / "bag", cleaned), video=tmp_path / "faint.mp4", over=video)
+    plot(record(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "faint.mp4", over=video)
     here = cleaned[0].bodies[0]
     x, y = np.round(pixels(here.positions)[hidden[:2]].mean(axis=0)).astype(int)
     strength = [np.abs(images(tmp_path / f"{name}.mp4")[0][y, 480 + x] - 90).max() for name in ("solid", "faint")]
@@ -118,11 +111,11 @@ def test_arrays_have_clean_alone(tmp_path: Path, cleaned: list[PoseClean], video
 def test_another_video_is_refused(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     later = [dataclasses.replace(message, stamp_ns=message.stamp_ns + 10**10) for message in cleaned]
     with pytest.raises(PlotError, match=r"clean .*video\.avi OUT' makes: .* ends after 0\.7 s, these begin at 10\.0 s"):
-        plot(record(tmp_path / "bag", later), video=tmp_path / "out.mp4", over=video)
+        plot(record(tmp_path / "bag", later, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     for message in cleaned:
         message.bodies[0].positions[:] = message.bodies[0].positions[:, [2, 0, 1]] * [1.0, 1.0, -1.0]
     with pytest.raises(PlotError, match="none of these lies within its images"):
-        plot(record(tmp_path / "world", cleaned), video=tmp_path / "out.mp4", over=video)
+        plot(record(tmp_path / "world", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     assert not (tmp_path / "out.mp4").exists()
     with pytest.raises(PlotError, match="over: expected a video that OpenCV can read"):
         plot(tmp_path / "bag", video=tmp_path / "out.mp4", over=tmp_path / "nowhere.mp4")
