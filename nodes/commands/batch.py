@@ -112,7 +112,6 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     if jobs is not None and (ray or jobs < 1):
         raise LaunchError("--jobs: " + ("Ray decides how many" if ray else f"expected 1 or more, got {jobs}"))
     found = plan(folder, out)
-    _check(settings)
     manifest = Manifest(out, folder, settings)
     waiting = [replace(job, replace=manifest.made(job.out)) for job in found if not manifest.is_done(job)]
     if known := len(found) - len(waiting):
@@ -284,12 +283,3 @@ def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[
             except ray.exceptions.RayError as error:
                 result = _failed(str(error))
             yield pending.pop(reference), result
-
-
-def _check(settings: Settings) -> None:
-    """Find here what every recording would stumble over."""
-    from steadypose.nodes.graph.prior_node import make_prior
-    from steadypose.nodes.graph.trajectory_node import make_trajectory
-
-    make_prior(settings["prior"])
-    make_trajectory(settings["trajectory"])
