@@ -82,21 +82,10 @@ def _main(arguments: list[str]) -> int:
         status = _run(name, arguments[1:])
     except KeyboardInterrupt:
         return INTERRUPTED
-    except ModuleNotFoundError as error:
-        if error.name == "steadypose.benchmarks":
-            print(
-                f"steadypose {name}: the studies are not installed: expected a checkout of the project", file=sys.stderr
-            )
-            return USAGE_ERROR
-        missing = (error.name or "").partition(".")[0]
-        if (extra := extra_of(missing)) is None:
-            raise
-        print(f"steadypose {name}: {how_to_install([missing], extra)}", file=sys.stderr)
-        return USAGE_ERROR
     except Exception as error:
-        if isinstance(error, BrokenPipeError) or not is_for_user(error):
+        if (told := told_of(error)) is None:
             raise
-        print(f"steadypose {name}: {error}", file=sys.stderr)
+        print(f"steadypose {name}: {told}", file=sys.stderr)
         return USAGE_ERROR
     return status if isinstance(status, int) else 0
 
@@ -144,9 +133,16 @@ def _wrapped() -> Iterator[None]:
             print(line if line[:1] in (" ", "│", "╭", "╰", "") else textwrap.fill(line, width, break_on_hyphens=False))
 
 
-def is_for_user(error: Exception) -> bool:
-    """Whether an error is meant for the user: steadypose's own errors and OSErrors. Any other is a bug."""
-    return isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
+def told_of(error: Exception) -> str | None:
+    """What the user is told of an error that is steadypose's own, an OSError or a missing extra; None of a bug."""
+    if isinstance(error, ModuleNotFoundError):
+        if error.name == "steadypose.benchmarks":
+            return "the studies are not installed: expected a checkout of the project"
+        missing = (error.name or "").partition(".")[0]
+        extra = extra_of(missing)
+        return how_to_install([missing], extra) if extra else None
+    own = isinstance(error, OSError) or type(error).__module__.startswith("steadypose.")
+    return str(error) if own and not isinstance(error, BrokenPipeError) else None
 
 
 def usage() -> str:

@@ -25,7 +25,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.nodes.cli import is_for_user
+from steadypose.nodes.cli import told_of
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import NOBODY, Settings
 from steadypose.nodes.extras import require_extra
@@ -220,7 +220,7 @@ def work(job: Job, settings: Settings) -> dict[str, Any]:
     try:
         return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=job.replace))
     except Exception as error:  # any file may hold what nobody thought of, and the others wait
-        return _failed(str(error) if is_for_user(error) else "".join(traceback.format_exception_only(error)).strip())
+        return _failed(told_of(error) or "".join(traceback.format_exception_only(error)).strip())
 
 
 def _failed(error: str) -> dict[str, Any]:

@@ -71,10 +71,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j[:, :17], fps=30, skeleton="COCO_17"),
         "did you mean 'coco17'",
     ),
-    "a skeleton that nobody knows": (
-        lambda j: steadypose.Filter(skeleton="thing"),
-        "expected one of smpl22, coco17",
-    ),
+    "a skeleton that nobody knows": (lambda j: steadypose.Filter(skeleton="thing"), "expected one of smpl22, coco17"),
     "no rate": (lambda j: steadypose.clean(j), "of a regular stream give fps, 30 for instance"),
     "stamps in seconds": (
         lambda j: steadypose.clean(j, stamp_ns=seconds()),
@@ -93,10 +90,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean([frame[: 20 + k % 2].tolist() for k, frame in enumerate(j)], fps=30),
         "have NaN there, not fewer entries",
     ),
-    "None for a missing joint": (
-        lambda j: steadypose.clean(with_none(j), fps=30),
-        "NaN",
-    ),
+    "None for a missing joint": (lambda j: steadypose.clean(with_none(j), fps=30), "NaN"),
     "a file that does not exist": (lambda j: steadypose.clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
     "a setting that there is not": (
         lambda j: steadypose.clean(j, fps=30, settings={"prior": {"delya": 2}}),
@@ -183,11 +177,7 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     ),
     "a broken .npy": (["clean", "in.npy", "out.npz"], {"in.npy": "x"}, "in.npy: cannot be read"),
     "a picture": (["clean", "in.png", "out.npz"], {"in.png": "x"}, "or a video, got '.png'"),
-    "a text to draw": (
-        ["plot", "in.txt"],
-        {"in.txt": "x"},
-        "in.txt: expected a rosbag2 directory, an .mcap",
-    ),
+    "a text to draw": (["plot", "in.txt"], {"in.txt": "x"}, "in.txt: expected a rosbag2 directory, an .mcap"),
     "a folder that cannot be written to": (
         ["clean", "in.csv", "/proc/out.npz"],
         {"in.csv": "stamp,left_hip_x,left_hip_y,left_hip_z\n0,0,0,0\n"},
