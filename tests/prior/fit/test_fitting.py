@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -70,16 +69,6 @@ def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: Moti
     flat, deep = (fitted(model, track.starts, track.observed, 2, BRIEF) for track in (taken.flat, taken.deep))
     assert error(flat.joints, taken.truth) < 0.3
     assert error(deep.joints, taken.truth) < min(0.1, error(flat.joints, taken.truth))
-
-
-@pytest.mark.parametrize("frames", [8, 90, 91, 165, 400])
-def test_windows_cover_all_and_overlap(frames: int) -> None:
-    bounds = window_bounds(frames)
-    assert bounds[0][0] == 0
-    assert bounds[-1][1] == frames
-    for (_, end), (first, last) in pairwise(bounds):
-        assert end - first >= windows.OVERLAP
-        assert last - first == windows.FRAMES
 
 
 def test_a_long_track_is_one_motion_and_done_windows_are_not_done_again(

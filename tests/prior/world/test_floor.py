@@ -44,14 +44,6 @@ def test_it_is_guessed_from_feet_that_are_seen(seen: bool):
     assert floor.height == (-1.2 if seen else 0.0)
 
 
-def test_once_sure_it_is_slow():
-    floor = Floor(calibrated=False)
-    stand(floor, 0.0, seconds=20)
-    before = floor.height
-    stand(floor, 0.04, seconds=1)
-    assert 0 < floor.height - before < 0.01
-
-
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_a_floor_that_nobody_touches_is_given_up_unless_calibrated(calibrated: bool):
     floor = Floor(calibrated)
@@ -60,15 +52,6 @@ def test_a_floor_that_nobody_touches_is_given_up_unless_calibrated(calibrated: b
     assert floor.height == pytest.approx(0.0, abs=0.02)
     stand(floor, 0.3, seconds=10)
     assert floor.height == pytest.approx(0.0 if calibrated else 0.3, abs=0.02)
-
-
-def test_feet_under_the_floor_are_believed_in_time_but_not_at_once():
-    floor = Floor(calibrated=False)
-    stand(floor, 0.0, seconds=20)
-    floor.observe(np.array([*HERE, -0.2]), 0.02, DT)
-    assert abs(floor.height) < 0.03
-    stand(floor, -0.2, seconds=4)
-    assert floor.height == pytest.approx(-0.2, abs=0.02)
 
 
 def test_a_step_is_a_level_where_it_was_stood_on():

@@ -106,18 +106,6 @@ def test_agrees_with_a_textbook_filter():
         np.testing.assert_allclose(ours.covariance[a::3, a::3], each.p[:2, :2], atol=1e-8)
 
 
-def test_a_standing_foot_holds_the_root_and_stops_it():
-    f = at_origin(BodyNoise(acceleration=1.0, rest=0.01), jitter=0.01)
-    foot = np.array([0.1, 0.2, -0.9])
-    f.observe_foot(0, foot, 0.003, 0.003, from_root=False)
-    for _ in range(60):
-        f.predict(DT, RESTS, RESTS)
-        f.observe_velocity(np.array([0.3, 0.0, 0.0]), 0.1, bias=0.3)  # a network that is wrong
-        f.observe_foot(0, foot, 0.003, 0.003, from_root=True)
-    assert np.linalg.norm(f.position) < 0.03
-    assert np.linalg.norm(f.velocity) < 0.1
-
-
 def test_foot_height_tells_only_the_height_of_root_and_foot():
     f = BodyFilter(BodyNoise(), np.zeros(3), 0.5, 0.0, np.zeros(3), feet=2)
     f.observe_foot(1, np.array([0.0, 0.0, -0.9]), 0.01, 0.0, from_root=True)
