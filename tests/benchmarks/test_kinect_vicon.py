@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
 
 from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
 from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.studies import kinect_clips, kinect_methods
 from steadypose.benchmarks.studies.kinect_clips import (
     MARKERS,
+    OTHER_SIDE,
     SCORED,
     Clip,
     align,
@@ -34,6 +36,7 @@ REST = np.array(
     + [[x, sign * y, z] for x, y, z in ((0, 0.2, 1.4), (0.1, 0.25, 1.1), (0.3, 0.25, 1.0)) for sign in (1, -1)]
     + [[x, sign * y, z] for x, y, z in ((0, 0.1, 0.9), (0.1, 0.1, 0.5), (0, 0.1, 0.1)) for sign in (1, -1)]
 )
+KALMAN = "Kalman, constant velocity"
 OFFSET = np.random.default_rng(0).normal(0, 0.03, REST.shape)
 
 
@@ -102,6 +105,11 @@ def test_clips_side_by_side_are_filtered_as_if_alone(run: partial) -> None:
         np.testing.assert_allclose(answer, run_filter([one], run)[0], atol=1e-12)
 
 
+def chance_of_order(wrong: np.ndarray, stated: np.ndarray) -> float:
+    """The chance that what is wrong is stated to be more so than what is not: the area under a ROC curve."""
+    return round(float((stated[wrong][:, None] > stated[~wrong]).mean()), 3)
+
+
 def test_what_is_stated_is_held_against_the_error() -> None:
     rng = np.random.default_rng(5)
     sigma = rng.uniform(0.01, 0.1, (400, len(SCORED)))
@@ -111,6 +119,12 @@ def test_what_is_stated_is_held_against_the_error() -> None:
     expected = {"rank_correlation": 0.5, "auroc_off": 0.85, "auroc_worst_anomaly": 1.0, "found_by_stated": 1.0}
     assert honest == {**honest, **{key: pytest.approx(value, abs=0.15) for key, value in expected.items()}}
     assert honest["flagged_percent"] == 1.0
+    known = np.isfinite(error)
+    assert honest["off_percent"] == round(100 * float(np.mean(error[known] > 0.1)), 2)
+    assert honest["rank_correlation"] == round(float(np.asarray(spearmanr(sigma[known], error[known]))[0]), 3)
+    assert honest["auroc_off"] == chance_of_order(error[known] > 0.1, sigma[known])
+    mean, spread = np.nanmean(error, axis=1), np.sqrt(np.nanmean(np.where(known, sigma, np.nan) ** 2, axis=1))
+    assert honest["auroc_worst"] == chance_of_order(mean > np.quantile(mean, 0.9), spread)
     tenfold = np.where(np.arange(400) < 40, 10.0, 1.0)[:, None]
     tenth = deviation(tenfold * error, tenfold * sigma, np.zeros(400), np.zeros(400, dtype=bool))
     assert tenth["auroc_worst"] == pytest.approx(1.0, abs=0.01)
@@ -200,7 +214,8 @@ def test_a_correction_is_learned_of_the_others_once(
 
 
 def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
-    clips = [clip(s, 30)._replace(subject=who, name=f"m01_{who}_e01") for s, who in enumerate(("s01", "s02", "s03"))]
+    names = {"s01": "m01_s01_e01", "s02": "m01_s02_e01", "s03": "m01_s03_e01_inc"}
+    clips = [clip(s, 30)._replace(subject=who, name=name) for s, (who, name) in enumerate(names.items())]
     truths = [c.centres for c in clips]
     scores = score(truths, align(truths, [c.raw for c in clips]), np.zeros_like(OFFSET))
     lagged = dataclasses.replace(scores, **{
@@ -211,7 +226,8 @@ def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
     for name in ("position", "moving", "acceleration"):
         assert a[f"{name}_mm"] == b[f"{name}_mm"] == pytest.approx(1e3 * getattr(scores, name)[1:].mean(), abs=1e-2)
         assert a[f"{name}_ci_mm"] == b[f"{name}_ci_mm"]
-    assert a["groups"]["done right"] == b["groups"]["done right"]
+    assert a["groups"]["done right"] == b["groups"]["done right"] == a["groups"]["s02"]
+    assert a["groups"]["done wrong"] == a["groups"]["s03"]
 
 
 def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers(
@@ -234,3 +250,44 @@ def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers
     np.testing.assert_array_equal(one.raw[:, wrist], to_canonical(KINECT22, pair.kinect)[0][:, J["left_wrist"]])
     np.testing.assert_array_equal(one.centres[:, wrist], pair.vicon[:, J["left_wrist"]])
     np.testing.assert_allclose(one.markers[:, wrist], pair.markers[:, back].mean(axis=1))
+
+
+@pytest.mark.parametrize(("quick", "steps"), [(True, 60), (False, 1000)])
+def test_regressions_learn_what_the_best_filter_of_their_delay_leaves(
+    quick: bool, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[tuple[Any, ...]] = []
+
+    def smoothed(clips: Sequence[np.ndarray], scored: Sequence[int], *given: Any) -> tuple[Any, ...]:
+        assert list(scored) == [J[name] for name in SCORED]
+        return ("smoothed", len(clips), *given)
+
+    def learn(*given: Any, **more: Any) -> Any:
+        called.append(given)
+        return lambda one: one
+
+    monkeypatch.setattr(kinect_methods.kinect_regression, "smoothed", smoothed)
+    monkeypatch.setattr(kinect_methods.kinect_regression, "ridge", learn)
+    monkeypatch.setattr(kinect_methods.kinect_regression, "temporal_convolution", learn)
+    clips = [clip(n, 12)._replace(subject=who, name=f"{n}") for n, who in enumerate(("s01", "s02", "s02"))]
+    bench = Bench(quick=quick, mocap=None, data=Path("nowhere.npz"), progress=Progress(disable=True))
+    bench.__dict__["smoothnets"] = []
+    kinect = Kinect(bench, Path("nowhere.npz"), clips, clips)
+    monkeypatch.setattr(Kinect, "correction", lambda self, who: Path(f"without-{who}"))
+    zero = dict.fromkeys(("s01 acceleration_mm", "s02 position_mm", "s02 acceleration_mm"), 0.0)
+    best = {
+        (KALMAN, d): Tuned({}, [{"density": x, "s01 position_mm": p, **zero} for x, p in ((9.0, 5.0), (1.0 + d, 1.0))])
+        for d in bench.delays
+    }
+    methods = list(kinect.methods("s02", best))
+    expected = []
+    for delay in bench.delays:
+        truths, ahead = [clips[0].centres], min(delay, 4)
+        expected.append((("smoothed", 1, delay, 0, 1.0 + delay), truths, 2200.0))
+        expected.append((("smoothed", 1, delay, ahead, 1.0 + delay), truths, OTHER_SIDE, ahead, steps))
+    assert called == expected
+    names = [KALMAN, "ridge regression", "temporal convolution", "steadypose", "steadypose, sensor known"]
+    found = sorted((method.name, method.delay) for method in methods)
+    assert found == sorted((name, delay) for name in names for delay in bench.delays)
+    answer = next(m for m in methods if (m.name, m.delay) == ("temporal convolution", bench.delays[-1])).run(clips[1:])
+    assert answer == (["smoothed", 2, bench.delays[-1], 4, 1.0 + bench.delays[-1]], None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,3 +140,37 @@ def test_a_kinects_correction_is_of_the_subjects_that_are_named(
     assert read == [(data, "s05"), (data, "s02")]
     card = path.with_suffix(".md").read_text()
     assert all(words in card for words in ("error of a Kinect v2", "Kinect beside Vicon: s05, s02", "Apache-2.0"))
+
+
+@pytest.mark.parametrize(("steps", "evaluations"), [(50, 1), (250, 2), (None, 40)])
+def test_a_training_says_its_mean_error_since_it_was_last_evaluated(
+    steps: int | None, evaluations: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: dict[str, Any] = {}
+
+    class Kept:
+        def __init__(self, model: str, network: Any, loss: Any, evaluate: Any, *numbers: Any, **more: Any) -> None:
+            kept.update(network=network, loss=loss, numbers=numbers, **more)
+
+        def train(self, *_: Any, **__: Any) -> Path:
+            return tmp_path
+
+    monkeypatch.setattr(sensor_bias, "Recipe", Kept)
+    x, y = torch.randn(40, FEATURES) * 3.0 + 1.0, torch.randn(40, 22, 3)
+    x[:, 0], x[3:, 1], x[:, 2] = 5.0, torch.nan, torch.nan
+    sensor_bias._train(TrainingOptions(tmp_path, tmp_path, "mine", iterations=steps), x, y, "a", "b", "c")
+    assert kept["numbers"] == (4_000, 256, 1e-3, "frames")
+    assert (kept["evaluations"], kept["decay"], kept["clip"]) == (evaluations, 1e-2, np.inf)
+    net = kept["network"]()
+    torch.testing.assert_close(net.mean, x.nanmean(dim=0).nan_to_num())
+    spread = torch.from_numpy(np.nanstd(x.numpy()[:, 3:], axis=0))
+    torch.testing.assert_close(net.scale[3:], spread)
+    assert net.scale[0] == 0.01
+    rng, losses, window = np.random.default_rng(0), [], (steps or 4_000) // evaluations
+    for _ in range(window + 3):
+        loss, terms = kept["loss"](net, 4, 0.0, rng)
+        losses.append(1e3 * float(loss.detach()))
+        assert terms["training mm"] == pytest.approx(np.mean(losses[-window:]))
+    schedule = kept["schedule"](torch.optim.AdamW(net.parameters(), lr=1e-3), 10)
+    assert schedule.total_steps == 10
+    assert schedule.optimizer.param_groups[0]["max_lr"] == 2e-3

@@ -6,13 +6,13 @@ import numpy as np
 import torch
 from tests.helpers.bodies import waving
 
-from steadypose.prior.body.kinematics import rotation_matrices
+from steadypose.prior.body.kinematics import rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit import optimise
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.optimise import Optimiser
-from steadypose.prior.fit.tensors import to_6d
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, heading, to_6d
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import CompleterConfig, solved_rotations
 from steadypose.prior.models.hmvae import HMVAEConfig
@@ -80,3 +80,26 @@ def test_who_is_still_before_and_after_a_gap_is_still_in_it(monkeypatch) -> None
     positions[6:9] = np.nan
     rotations, _ = optimiser(positions[None], REST_OFFSETS[None])
     np.testing.assert_allclose(rotations[0, 6:9], np.tile(rotations[0, :1], (3, 1, 1, 1)), atol=1e-6)
+
+
+def test_joints_and_rotations_to_meet_are_of_one_pose_from_the_root_without_heading(monkeypatch) -> None:
+    optimiser, _, _ = make(monkeypatch)
+    given = []
+
+    def kept(self, begun, seen, starts, back):
+        given.append((seen, starts, back))
+        return begun
+
+    monkeypatch.setattr(Optimiser, "_search", kept)
+    turned = waving(27) @ yaw_matrix(1.0).T + [3.0, 2.0, 0.0]
+    optimiser(turned[None], REST_OFFSETS[None])
+    ((seen, starts, back),) = given
+    assert starts.tolist() == [0, 11]
+    assert seen.rotations.all()
+    assert seen.places.all()
+    joints, _ = forward_kinematics(from_6d(seen.columns), seen.offsets)
+    torch.testing.assert_close(joints, seen.joints, atol=8e-3, rtol=0)
+    rows = starts[:, None] + np.arange(WINDOW)
+    placed = seen.joints @ back.mT[:, None]
+    np.testing.assert_allclose(placed.numpy(), (turned - turned[:, :1])[rows], atol=1e-5)
+    assert heading(from_6d(seen.columns)[:, WINDOW // 2 - 1, 0]).abs().max() < 1e-5

@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import waving
 
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.fit.motion import Motion
-from steadypose.prior.fit.solve import FitSettings, Start, _stages
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.fit import windows
+from steadypose.prior.fit.energy import energy
+from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
+from steadypose.prior.fit.motion import Motion, Variables
+from steadypose.prior.fit.observations import SeenJoints
+from steadypose.prior.fit.solve import FitSettings, Start, _stages, fit_window
 from steadypose.prior.fit.windows import _fingerprint, _grounded, _joined, load_of, window_bounds
 
 
@@ -93,3 +99,63 @@ def test_a_floor_that_is_known_is_no_variable_and_only_the_last_stage_has_latent
     assert names[0] == ["Smooth"]
     assert names[1] == ["Bones", *ground, "Smooth", "FirstState"]
     assert names[2] == ["Bones", *ground, "Transitions", "FirstState", "Standing", "Smooth"]
+
+
+def test_each_stage_lowers_the_energy_of_its_terms_and_says_so() -> None:
+    torch.manual_seed(0)
+    model = HumorNet(HumorConfig(hidden=64, latent=4, components=2)).eval()
+    positions = waving(6) + 0.01 * np.random.default_rng(0).standard_normal((6, 22, 3))
+    start = Start.of(positions[:, 0] + 0.05, np.tile(np.eye(3), (6, 22, 1, 1)), REST_OFFSETS)
+    seen = SeenJoints(torch.from_numpy(positions).float(), torch.full((6, 22), 0.02))
+    brief, told = FitSettings(root_steps=20, pose_steps=20, motion_steps=20), []
+    found = fit_window(model, start, [seen], brief, advanced=lambda: told.append(1))
+    assert len(found.energies) == len(told) == 3
+    assert not any(p.requires_grad for p in model.parameters())
+    assert not found.motion.variables.root.requires_grad
+    stages, before = (
+        _stages(start, [seen], brief),
+        Variables.initial(start.root, start.rotations, start.offsets, 0.0, 4),
+    )
+    assert float(energy(found.motion, stages[2].terms)) == pytest.approx(found.energies[2], rel=1e-4)
+    for number in (1, 2):
+        upto = fit_window(model, start, [seen], brief, stages=number)
+        assert upto.energies == pytest.approx(found.energies[:number], rel=1e-3)
+        value = float(energy(upto.motion, stages[number - 1].terms))
+        assert value == pytest.approx(upto.energies[-1], rel=1e-4)
+        assert value < 0.6 * float(energy(Motion(model, before), stages[number - 1].terms))
+        changed = {name for name in stages[2].free if getattr(upto.motion.variables, name).any()}
+        assert changed == set(stages[number - 1].free)
+
+
+def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its bones and its floor, and from the start that fitted it best."""
+    monkeypatch.setattr(windows, "FRAMES", 8)
+    monkeypatch.setattr(windows, "OVERLAP", 2)
+    given: list[tuple[Start, Any, Any, int]] = []
+
+    def fit(model: Any, start: Start, seen: Any, settings: Any, *, anchor: Any, stages: int) -> Any:
+        given.append((start, seen[0], anchor, stages))
+        return SimpleNamespace(energies=(9.0, float(start.root[0, 0])), frames=len(start.root), number=len(given))
+
+    def arrays(fitted: Any, seen: Any) -> dict[str, Any]:
+        return {**window(fitted.number, 0.0, fitted.frames), "misfit": np.zeros((1, fitted.frames, 22))}
+
+    monkeypatch.setattr(windows, "fit_window", fit)
+    monkeypatch.setattr(windows, "_arrays", arrays)
+    roots = np.arange(42.0).reshape(14, 3)
+    starts = [Start.of(roots + off, np.tile(np.eye(3), (14, 22, 1, 1)), REST_OFFSETS) for off in (5.0, 0.0)]
+    seen = SeenJoints(torch.arange(14 * 66).reshape(14, 22, 3).float(), torch.ones(14, 22))
+    told: list[int] = []
+    settings, model = FitSettings(), cast(Any, torch.nn.Linear(1, 1))
+    windows.fit_track(
+        model, windows.Track(starts, [seen]), settings, stages=2, advanced=lambda: told.append(len(given))
+    )
+    assert told == [2, 3], "the second window only from the better start"
+    assert [stages for *_, stages in given] == [2, 2, 2]
+    start, joints, anchor, _ = given[2]
+    np.testing.assert_array_equal(start.root.numpy(), roots[6:14])
+    np.testing.assert_array_equal(joints.positions.numpy(), seen.positions[6:14].numpy())
+    assert (start.offsets == 2.0).all()
+    assert start.ground == 2.0
+    np.testing.assert_array_equal(anchor.joints.numpy(), np.full((2, 22, 3), 2.0))
+    assert given[0][2] is given[1][2] is None

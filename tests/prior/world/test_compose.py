@@ -85,8 +85,8 @@ def test_rotations_that_are_none_are_left_alone():
     np.testing.assert_array_equal(turn_legs(rotations, positions, positions + 0.01), rotations)
 
 
-def composed(lost_sigma: float = 0.5, **fields: Any) -> tuple[WorldBody, BodyEstimate]:
-    """A body walking at 2 m/s as published, with heels estimated 5 cm from where they are seen and no toes."""
+def composed(lost_sigma: float = 0.5, speed: float = 2.0, **fields: Any) -> tuple[WorldBody, BodyEstimate]:
+    """A body that moves on resting feet as published, heels 5 cm from where they are seen, and no toes."""
     rotations, positions = pose(6)
     values = {name: np.full(22, 0.01) for name in ("sigma", "joint_anomaly", "bone_lengths", "raw_confidence")}
     body = CleanBody(
@@ -101,7 +101,7 @@ def composed(lost_sigma: float = 0.5, **fields: Any) -> tuple[WorldBody, BodyEst
     heels[:2] = observed.feet[:2] + [0.05, 0.0, 0.0]
     covariance = np.diag([0.3, 0.4, 0.1, 0.02, 0.02, 0.02]) ** 2
     root = RootState(
-        np.array([1.0, 2.0, 1.0]), np.array([2.0, 0.0, 0.0]), covariance, heels, np.full((4, 3), 0.02),
+        np.array([1.0, 2.0, 1.0]), np.array([speed, 0.0, 0.0]), covariance, heels, np.full((4, 3), 0.02),
         np.array([0.1, 0.2, 0.3]),
     )  # fmt: skip
     ramp = np.linspace(0, 1, 8, dtype=np.float32)
@@ -139,3 +139,9 @@ def test_a_body_is_lost_beyond_a_horizontal_deviation(lost_sigma: float, lost: b
 def test_a_velocity_is_surer_than_the_filter_states_where_the_pelvis_is_observed(pelvis: bool, share: float) -> None:
     body, _ = composed(pelvis_observed=pelvis)
     np.testing.assert_allclose(np.sqrt(np.diag(body.covariance)), [0.3, 0.4, 0.1, *[0.02 * share] * 3], rtol=1e-6)
+
+
+def test_only_over_feet_that_are_seen_to_rest_a_slow_root_sways() -> None:
+    speeds = [composed(speed=0.02, root_sigma=sigma)[0].root_velocity[0] for sigma in (0.02, np.inf)]
+    assert speeds[0] < 0.018
+    assert speeds[1] == pytest.approx(0.02)

@@ -27,23 +27,27 @@ def settle(above: float, variances: np.ndarray = UNSURE, rest: np.ndarray = REST
     return Soles().settle(SOLE + above, variances, floor, 0.0, rest, FOUR, DT)
 
 
-def test_the_standing_part_is_the_product_of_two_gaussians():
+@pytest.mark.parametrize("above", [-0.01, 0.01])
+def test_the_standing_part_is_the_product_of_two_gaussians(above: float):
+    """And what is anywhere above stands too if it is seen below."""
     grid = np.linspace(-0.2, 0.3, 20_001)
-    heights, variances, stands = settle(-0.01)
+    heights, variances, stands = settle(above)
     for k in range(4):
         s = np.hypot(SOLE_SIGMA[k // 2], UNEVEN)
-        seen, stand = norm.pdf(grid, SOLE[k] - 0.01, 0.02), norm.pdf(grid, SOLE[k], s)
+        seen, stand = norm.pdf(grid, SOLE[k] + above, 0.02), norm.pdf(grid, SOLE[k], s)
         total = np.hypot(0.02, s)
         both = seen * stand / (seen * stand).sum()
         mean, known = (both * grid).sum(), 1 - OUTLIER
         air = np.hypot(AIR_M, np.sqrt(2 * np.pi) * total)
         weights = np.array([
-            known * RESTS[k] * norm.pdf(-0.01, 0, total), known * (1 - RESTS[k]) * norm.cdf(-0.01 / total) / air,
+            known * RESTS[k] * norm.pdf(above, 0, total), known * (1 - RESTS[k]) * norm.cdf(above / total) / air,
             OUTLIER / air,
         ])  # fmt: skip
         weights /= weights.sum()
-        means = np.array([mean, mean, SOLE[k] - 0.01])
-        spreads = np.array([(both * (grid - mean) ** 2).sum()] * 2 + [0.02**2])
+        free = SOLE[k] + above
+        means = np.array([mean, mean if above < 0 else free, free])
+        narrow = (both * (grid - mean) ** 2).sum()
+        spreads = np.array([narrow, narrow if above < 0 else 0.02**2, 0.02**2])
         assert stands[k] == pytest.approx(weights[0])
         assert heights[k] == pytest.approx(weights @ means, abs=1e-6)
         assert variances[k] == pytest.approx(weights @ (spreads + means**2) - (weights @ means) ** 2, abs=1e-8)
