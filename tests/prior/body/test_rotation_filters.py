@@ -12,6 +12,7 @@ from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
 OFFSETS = REST_OFFSETS[None]
 EXACT = np.full((1, 22), 1e-5)
 SHOULDER, ELBOW = J["left_shoulder"], J["left_elbow"]
+HANDS, FEET = ([J[f"{side}_{joint}"] for side in ("left", "right")] for joint in ("wrist", "foot"))
 SHORT = [J[name] for name in ("spine2", "neck", "left_collar", "right_collar")]
 FRAMES, SIGMA = 900, 0.02
 
@@ -37,11 +38,15 @@ def test_a_bent_arm_shows_its_twist_at_once() -> None:
     np.testing.assert_allclose(turned, as_solved, atol=2e-3)
 
 
-def test_joints_stay_where_they_are() -> None:
-    turned, noisy = _arm(0.5, 0.2), np.full((1, 22), 0.03)
-    before = place_joints(_local(turned), OFFSETS)
-    follow_twist(turned, OFFSETS, noisy, unknown_twist(1))
-    np.testing.assert_allclose(place_joints(_local(turned), OFFSETS), before, atol=1e-12)
+def test_joints_stay_where_they_are_and_hands_and_toes_go_along() -> None:
+    vectors, ends = np.random.default_rng(0).normal(0.0, 0.3, (22, 3)), [*HANDS, *FEET]
+    local = Rotation.from_rotvec(vectors).as_matrix()[None]
+    turned = global_rotations(local)
+    follow_twist(turned, OFFSETS, np.full((1, 22), 0.1), unknown_twist(1))
+    found = _local(turned)
+    assert Rotation.from_matrix(local[0, SHOULDER].T @ found[0, SHOULDER]).magnitude() > 0.01
+    np.testing.assert_allclose(place_joints(found, OFFSETS), place_joints(local, OFFSETS), atol=1e-12)
+    np.testing.assert_allclose(found[:, ends], local[:, ends], atol=1e-12)
     np.testing.assert_allclose(turned @ turned.swapaxes(-1, -2), np.tile(np.eye(3), (1, 22, 1, 1)), atol=1e-12)
 
 

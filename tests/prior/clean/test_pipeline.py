@@ -11,7 +11,7 @@ from tests.helpers.values import clean
 
 from steadypose.msgs.codec import encode
 from steadypose.msgs.types import JointState, Pose, PoseClean
-from steadypose.prior.body.kinematics import forward_kinematics
+from steadypose.prior.body.kinematics import forward_kinematics, yaw_matrix
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.clean import core
@@ -60,7 +60,7 @@ def test_a_delay_longer_than_the_mixture_has_learned_is_refused() -> None:
 
 def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre() -> None:
     settings = {"fuse": {"enabled": False}, "person": {"enabled": False}, "refine": {"enabled": True}}
-    messages = stream(waving(30))
+    messages = stream(waving(30) @ yaw_matrix(-1.2))  # faces to its left
     centre, late = (clean(messages, delay=delay, **settings)[0] for delay in (4, 10))
     for a, b in list(zip(centre, late, strict=True))[:20]:
         assert np.allclose(a.bodies[0].rotations, b.bodies[0].rotations, atol=1e-6)
