@@ -95,6 +95,7 @@ def test_the_floor_is_where_toes_rest_or_under_the_lower_toe(height: float) -> N
     flying = standing(60, height)
     flying[:, :, 0] += 3.0 * np.arange(60)[:, None] / FPS
     flying[::2, :, 2] += 0.1
+    flying[:, J["left_foot"], 2] += 0.3
     assert floor_height(flying) == pytest.approx(height, abs=0.002)
 
 
