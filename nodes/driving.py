@@ -131,7 +131,7 @@ class OfflineRun:
         self.poses = 0
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
-        sensor = NOWHERE
+        sensor, calibrated = NOWHERE, False
         for topic, message in stream(self._source, self._prior, self._trajectory):
             if isinstance(message, PoseRaw) and not message.end_of_stream:
                 self._stamps_ns.append(message.stamp_ns)
@@ -140,9 +140,9 @@ class OfflineRun:
                     self.diagnosis.look()
             elif isinstance(message, PoseClean):
                 self.poses += len(message.bodies)
-                sensor = message.sensor_pose.position
+                sensor, calibrated = message.sensor_pose.position, message.calibrated
             elif self._timeline and topic == POSE_WORLD and isinstance(message, PoseWorld):
-                self._timeline.add(message, sensor)
+                self._timeline.add(message, sensor, calibrated=calibrated)
             yield topic, message
         self.diagnosis.end()
 

@@ -63,7 +63,7 @@ def told_of(messages: Iterable[PoseClean | PoseWorld], scene: Scene, settings: E
     times = scene.motions[0].times
     for message in messages:
         if isinstance(message, PoseClean):
-            events.sensor = message.sensor_pose.position
+            events.sensor, events.calibrated = message.sensor_pose.position, message.calibrated
             continue
         last |= {body.id: body.root_position for body in message.bodies}
         told_now = events.process(message)

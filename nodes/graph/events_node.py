@@ -16,16 +16,22 @@ REPEAT_NS = 1_000_000_000
 
 
 class EventStream:
-    """Turns one stream of ``pose/world`` into ``pose/events``, given the sensor's position."""
+    """Turns one stream of ``pose/world`` into ``pose/events``.
+
+    Attributes:
+        sensor: (3,) metres, world, the sensor's position.
+        calibrated: whether it is known, and so the floor.
+    """
 
     def __init__(self, settings: EventSettings) -> None:
         self._detector = EventDetector(settings)
         self._sent_ns: int | None = None
         self.sensor: NDArray[np.float64] = NOWHERE
+        self.calibrated = False
 
     def process(self, world: PoseWorld) -> PoseEvents | None:
         """The events to publish for one ``pose/world``; None if there is nothing to publish."""
-        events = self._detector.update(world, self.sensor)
+        events = self._detector.update(world, self.sensor, calibrated=self.calibrated)
         sent_ns = self._sent_ns
         since_ns = REPEAT_NS if sent_ns is None else abs(world.stamp_ns - sent_ns)
         changed = any(event.phase != Phase.HOLDS for event in events)
@@ -49,7 +55,8 @@ class EventsNode(Node):
         if isinstance(message, PoseClean):
             position = message.sensor_pose.position
             if np.isfinite(position).all():
-                self._stream(message.source).sensor = position
+                stream = self._stream(message.source)
+                stream.sensor, stream.calibrated = position, message.calibrated
         elif isinstance(message, PoseWorld):
             events = self._stream(message.source).process(message)
             if events is not None:

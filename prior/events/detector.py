@@ -104,13 +104,16 @@ class EventDetector:
         self._bodies: dict[int, _Body] = {}
         self._stamp_ns = -1
 
-    def update(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE) -> list[Event]:
+    def update(
+        self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False
+    ) -> list[Event]:
         """Return all events that begin, continue or end with the next message of the stream.
 
         Args:
             world: a message of ``pose/world``. A message whose stamp is not after the last starts the stream anew.
             sensor: (3,) metres, world, the position that people come near to and face. The default is the origin, above
                 which an uncalibrated sensor is.
+            calibrated: whether the sensor's position is known, and so the floor, even under legs that nobody sees.
         """
         if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
             self._bodies.clear()
@@ -118,10 +121,11 @@ class EventDetector:
         followed = {body.id: body for body in world.bodies if body.tracking != Tracking.LOST}
         for new in followed.keys() - self._bodies.keys():
             self._bodies[new] = _Body(new, world.stamp_ns, self._settings)
+        floor = -float(world.ground_plane[3]) if calibrated else math.nan
         events: list[Event] = []
         for name, body in list(self._bodies.items()):
             if name in followed:
-                events += body.update(world.stamp_ns, followed[name], sensor)
+                events += body.update(world.stamp_ns, followed[name], sensor, floor)
             elif world.stamp_ns - body.stamp_ns >= self._settings.left * 1e9:
                 events += body.leave(world.stamp_ns)
                 del self._bodies[name]
@@ -159,10 +163,10 @@ class _Body:
         self._wrists: deque[tuple[int, tuple[list[float], ...]]] = deque()
         self._arms: tuple[Arm, ...] = ()
 
-    def update(self, stamp_ns: int, body: WorldBody, sensor: NDArray[np.float64]) -> Iterator[Event]:
+    def update(self, stamp_ns: int, body: WorldBody, sensor: NDArray[np.float64], floor: float) -> Iterator[Event]:
         """Yield the events that begin, continue or end at ``stamp_ns``."""
         self.stamp_ns = stamp_ns
-        seen = features(body, sensor)
+        seen = features(body, sensor, floor)
         self._arms = seen.arms
         changed = self._changed(stamp_ns, seen)
         if not self._entered:

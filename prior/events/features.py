@@ -1,7 +1,8 @@
 """The quantities of a pose that events depend on, each with its standard deviation.
 
-All are differences between joints of the same body, in the z-up world frame. No floor is needed, and drift of the
-body's position affects only the distance to the sensor.
+Most are differences between joints of the same body, in the z-up world frame, so that drift of the body's position
+affects only the distance to the sensor. If both legs are only guesses, as behind a counter, the height of the hips over
+a known floor says whether a body stands or sits.
 """
 
 from __future__ import annotations
@@ -22,6 +23,12 @@ HAND = 0.18
 
 NARROW = 0.05
 """Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
+
+GUESSED = 0.1
+"""Standard deviation along an axis above which an unobserved ankle is only a guess, metres."""
+
+ANKLE, LEG_SIGMA = 0.07, 0.05
+"""Height of a standing adult's ankle over the floor, and standard deviation of an unobserved leg's length, metres."""
 
 EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
@@ -80,8 +87,11 @@ class Features(NamedTuple):
     """Left and right arm."""
 
 
-def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
-    """Compute the features of one body, relative to a sensor at (3,) metres, world."""
+def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.nan) -> Features:
+    """Compute the features of one body, relative to a sensor at (3,) metres, world.
+
+    ``floor`` is the height of a known floor, metres, world; NaN if there is none.
+    """
     known = body.state != JointState.UNKNOWN
     observed: list[bool] = np.isin(body.state, (JointState.SEEN, JointState.REFINED)).tolist()
     p: list[Point] = np.where(known[:, None], body.positions, np.nan).tolist()
@@ -95,6 +105,8 @@ def features(body: WorldBody, sensor: NDArray[np.float64]) -> Features:
     )
     extension = Quantity((hips[2] - p[ankle][2]) / leg, math.hypot(s[J["pelvis"]], s[ankle]) / leg)
     thigh = min((_thigh(p, s, side) for side in ("left", "right")), key=lambda q: _last_if_nan(q.value))
+    if all(not observed[joint] and s[joint] > GUESSED for joint in (J["left_ankle"], J["right_ankle"])):
+        extension, thigh = _from_height(p, hips[2] - floor - ANKLE, leg, s[J["pelvis"]])
     heights = sorted((p[joint][2], joint) for joint in EXTENT if not math.isnan(p[joint][2]))
     if len(heights) > len(EXTENT) // 2:
         (low, lowest), (high, highest) = heights[0], heights[-1]
@@ -143,6 +155,16 @@ def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
     hip, knee = J[f"{side}_hip"], J[f"{side}_knee"]
     length = _distance(p[hip], p[knee])
     return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
+
+
+def _from_height(p: list[Point], height: float, leg: float, sigma: float) -> tuple[Quantity, Quantity]:
+    """Extension of unobserved legs, and angle of their thighs if the shanks are upright, from the height of the hips
+    above a standing ankle and its standard deviation, metres."""
+    thigh = 0.5 * sum(_distance(p[J[f"{side}_hip"]], p[J[f"{side}_knee"]]) for side in ("left", "right"))
+    upright = max(-1.0, min(1.0, (height - leg + thigh) / max(thigh, 0.1)))
+    spread = math.hypot(sigma, LEG_SIGMA)
+    angle = math.nan if math.isnan(height) else math.acos(upright)
+    return Quantity(height / leg, spread / leg), Quantity(angle, spread / max(thigh, 0.1))
 
 
 def _arm(p: list[Point], s: list[float], observed: list[bool], left: list[float], side: str) -> Arm:

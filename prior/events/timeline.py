@@ -42,12 +42,12 @@ class EventTimeline:
         self._open: dict[tuple[int, EventKind, Hand], Event] = {}
         self._stamp_ns = -1
 
-    def add(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE) -> None:
+    def add(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False) -> None:
         """Add the next message of ``pose/world``; arguments as of `EventDetector.update`."""
         if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
             self._close_all()
         self._stamp_ns = world.stamp_ns
-        for event in self._detector.update(world, sensor):
+        for event in self._detector.update(world, sensor, calibrated=calibrated):
             key = event.body, event.kind, event.hand
             if event.kind in (EventKind.ENTERED, EventKind.LEFT):
                 self._ended.append(_timed(event, event.since_ns))

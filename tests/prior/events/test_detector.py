@@ -126,6 +126,33 @@ def test_a_pose_begins_one_event_within_a_third_of_a_second_and_ends_it(
     assert 40 < ends <= 45
 
 
+@pytest.mark.parametrize(("calibrated", "height"), [(True, 0.0), (True, 0.6), (False, 0.0)])
+def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits(
+    calibrated: bool, height: float
+) -> None:
+    """Legs are guessed to stand, always; a floor that is lower or unknown changes what is known of them."""
+    guessed = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    detector, found = EventDetector(), []
+    for index, pose in enumerate([*STILL, *[sitting()] * 20, *STILL]):
+        seen, hips = pose.copy(), pose[[J["left_hip"], J["right_hip"]]].mean(axis=0)
+        seen[guessed] = (standing() - standing()[J["pelvis"]])[guessed] + hips
+        world = message(index, seen + [0.0, 0.0, height])
+        body = world.bodies[0]
+        body.state[guessed], body.sigma[guessed] = JointState.IMPUTED, 0.14
+        world.ground_plane[3] = -height
+        found += [(index, event.kind, event.hand, event.phase) for event in
+                  detector.update(world, calibrated=calibrated) if event.phase != Phase.HOLDS]  # fmt: skip
+    if calibrated:
+        assert [kind for _, kind, _, phase in found if phase == Phase.BEGINS and kind != EventKind.FACES_SENSOR] == [
+            EventKind.ENTERED, EventKind.STANDS, EventKind.SITS, EventKind.STANDS
+        ]  # fmt: skip
+        begins = first(found, EventKind.SITS)
+        assert begins is not None
+        assert 20 < begins <= 30
+    else:
+        assert {EventKind.STANDS, EventKind.SITS}.isdisjoint({kind for _, kind, _, _ in found})
+
+
 def test_a_hand_swung_from_side_to_side_waves_and_one_that_is_only_raised_does_not() -> None:
     swings = [raised(standing(), swing=0.5 * np.sin(2 * np.pi * 1.5 * k / 30)) for k in range(45)]
     found = changes([*STILL, *[raised(standing())] * 5, *swings, *[raised(standing())] * 40])
