@@ -21,10 +21,10 @@ from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import ArraySource
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.source import RecordedSource
+from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.events.detector import NOWHERE
-from steadypose.prior.events.timeline import EventTimeline
 
 if TYPE_CHECKING:
     from steadypose.prior.clean.pipeline import PriorPipeline

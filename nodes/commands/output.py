@@ -26,9 +26,9 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector, write_csv, write_events
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.events.detector import EventSettings
-from steadypose.prior.events.timeline import EventTimeline
 from steadypose.prior.settings import build_settings
 
 In = Annotated[Path, tyro.conf.arg(name="in", metavar="IN")]

@@ -26,9 +26,9 @@ from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_pa
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
+from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.body.layouts import CANONICAL, add_layouts
 from steadypose.prior.events.detector import EventSettings
-from steadypose.prior.events.timeline import EventTimeline
 from steadypose.prior.settings import build_settings, nearest
 
 if TYPE_CHECKING:

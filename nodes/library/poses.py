@@ -17,8 +17,8 @@ from steadypose.msgs.types import CONTACTS, JOINTS, PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.sinks.drawing import to_world
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.nodes.timeline import TimedEvent
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
-from steadypose.prior.events.timeline import TimedEvent
 from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS, EventKind, JointState, Message, PoseClean, PoseWorld
 from steadypose.nodes.graph.clock import FRAME_NS
-from steadypose.prior.events.timeline import TimedEvent
+from steadypose.nodes.timeline import TimedEvent
 
 SLACK_NS = 1_000_000
 """Tolerance added to the frame period over which a grid row's values are held, nanoseconds."""

@@ -8,7 +8,7 @@ import numpy as np
 from tests.prior.events.test_detector import FRAME_NS, START_NS, message, pointing, raised, sitting, standing
 
 from steadypose.msgs.types import EventKind, Hand
-from steadypose.prior.events.timeline import EventTimeline
+from steadypose.nodes.timeline import EventTimeline
 
 
 def at(index: int) -> int:
