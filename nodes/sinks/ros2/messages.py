@@ -100,7 +100,7 @@ def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
     others = np.array([link != "body" for link in links])
     origins[others] = (origins[others] - root) @ heading
     turns[others] = heading.T @ turns[others]
-    quaternions = Rotation.from_matrix(turns, assume_valid=True).as_quat()
+    quaternions = Rotation.from_matrix(turns).as_quat()
     return [
         transform(
             world.stamp_ns, world.frame_id if link == "body" else f"body_{name}", f"{link}_{name}", origin, quaternion
@@ -152,7 +152,7 @@ def _pose(place: np.ndarray, quaternion: np.ndarray) -> Any:
 
 def _joint_poses(body: WorldBody) -> Iterator[Any]:
     """Poses of the 22 canonical joints in the world."""
-    turns = Rotation.from_matrix(joint_rotations(body), assume_valid=True).as_quat()
+    turns = Rotation.from_matrix(joint_rotations(body)).as_quat()
     return (_pose(place, turn) for place, turn in zip(body.positions, turns, strict=True))
 
 
