@@ -72,10 +72,10 @@ def placed(
     completed: Floats,
     completed_sigma: float,
 ) -> Placed:
-    """What is said of one body (1, 22, 3), whose bones are known, of which no joint is seen again within the delay."""
-    again, deviations = np.zeros((1, 22), dtype=bool), np.full((1, 22), completed_sigma)
+    """What is said of bodies (B, 22, 3), whose bones are known, of which no joint is seen again within the delay."""
+    count, again, deviations = len(seen), np.zeros(sigma.shape, dtype=bool), np.full(sigma.shape, completed_sigma)
     answer = joints.update(
-        np.arange(1), seen, sigma, unseen, again, completed, deviations, bones(truth), without_gaps()
+        np.arange(count), seen, sigma, unseen, again, completed, deviations, bones(truth), without_gaps(count)
     )
     assert answer is not None
     return answer
@@ -152,6 +152,18 @@ def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_g
     np.testing.assert_allclose(off[10:], 0.0, atol=0.05)
     shake = np.diff(off[10:], axis=0).std()
     assert shake < 0.01, "of 0.028, what differs from frame to frame in the completion"
+
+
+def test_limbs_never_seen_of_two_bodies_are_where_each_alone_has_them() -> None:
+    both, alone = OccludedJoints("default", 2), [OccludedJoints("default", 1) for _ in range(2)]
+    unseen = np.zeros((2, 22))
+    unseen[0, ARM] = unseen[1, LEG] = np.inf
+    sigma = np.where(unseen > 0, np.inf, 0.005)
+    for frame in walking(2)[:5]:
+        seen = np.where(unseen[..., None] > 0, np.nan, frame)
+        together = placed(both, frame, seen, sigma, unseen, frame, 0.03)
+        each = [placed(alone[k], frame[[k]], seen[[k]], sigma[[k]], unseen[[k]], frame[[k]], 0.03) for k in range(2)]
+        np.testing.assert_allclose(together.positions, np.concatenate([one.positions for one in each]), atol=1e-9)
 
 
 def test_limbs_that_were_never_seen_are_stated_less_sure_and_those_seen_in_part_are_not() -> None:
