@@ -271,12 +271,3 @@ def test_a_cloud_is_thinned_evenly(given: int, kept: int) -> None:
     assert found.shape == (2, kept, 3)
     steps = np.diff(found[0, :, 0])
     assert (steps == steps[:1]).all()
-
-
-def test_the_floor_is_moved_and_tilted_with_all_that_stands_on_it(model: HumorNet, variables: Variables) -> None:
-    level = replace(variables, ground=of([0.0, 0.0, 0.0]))
-    raised = replace(variables, ground=of([0.3, 0.0, 0.0]))
-    lifted = Motion(model, raised).world_joints - Motion(model, level).world_joints
-    torch.testing.assert_close(lifted, of([0.0, 0.0, 0.3]).expand_as(lifted))
-    tilted = Motion(model, replace(variables, ground=of([0.0, 0.1, 0.0])))
-    torch.testing.assert_close(tilted.world_joints @ tilted.tilt, Motion(model, level).joints)

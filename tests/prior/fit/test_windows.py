@@ -112,10 +112,8 @@ def test_each_stage_lowers_the_energy_of_its_terms_and_says_so() -> None:
     assert len(found.energies) == len(told) == 3
     assert not any(p.requires_grad for p in model.parameters())
     assert not found.motion.variables.root.requires_grad
-    stages, before = (
-        _stages(start, [seen], brief),
-        Variables.initial(start.root, start.rotations, start.offsets, 0.0, 4),
-    )
+    before = Variables.initial(start.root, start.rotations, start.offsets, 0.0, 4)
+    stages = _stages(start, [seen], brief)
     assert float(energy(found.motion, stages[2].terms)) == pytest.approx(found.energies[2], rel=1e-4)
     for number in (1, 2):
         upto = fit_window(model, start, [seen], brief, stages=number)
