@@ -14,6 +14,7 @@ from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.fit import tensors
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, transitions
 from steadypose.prior.fit.motion import Motion, Variables
+from steadypose.prior.models.completer_features import rotations_of_6d
 
 FRAMES = 7
 
@@ -43,6 +44,7 @@ def test_six_numbers_are_the_first_two_columns_and_any_six_are_a_rotation() -> N
     torch.testing.assert_close(six, torch.cat([matrix[..., 0], matrix[..., 1]], dim=-1))
     torch.testing.assert_close(tensors.from_6d(six), matrix)
     found = tensors.from_6d(some(5, 6))
+    np.testing.assert_allclose(found.numpy(), rotations_of_6d(some(5, 6).numpy()), atol=1e-9)
     torch.testing.assert_close(found @ found.mT, torch.eye(3).double().expand(5, 3, 3))
     torch.testing.assert_close(torch.linalg.det(found), torch.ones(5).double())
     first = some(5, 6)[:, :3]

@@ -12,8 +12,7 @@ from tests.helpers.prepared import write_motion
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.fit.hmvae_network import HMVAE, SkeletonConv
-from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_tensors, remove_heading, to_6d, yaw_rotation
-from steadypose.prior.models.completer_features import rotations_of_6d
+from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_tensors, remove_heading, to_6d
 from steadypose.prior.models.hmvae import HMVAEConfig, LiveHMVAE
 from steadypose.prior.models.weights import WEIGHTS
 from steadypose.training.data.dataset import MotionSet, mirror_offsets, mirror_rotations
@@ -25,16 +24,6 @@ from steadypose.training.weights import arrays_of
 def random_rotations(*shape: int) -> torch.Tensor:
     count = int(np.prod(shape))
     return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(0)).as_matrix()).reshape(*shape, 3, 3)
-
-
-def test_six_numbers_are_the_first_two_columns_and_back() -> None:
-    rotations = random_rotations(5, 22)
-    assert torch.equal(to_6d(rotations)[0, 0], torch.cat([rotations[0, 0, :, 0], rotations[0, 0, :, 1]]))
-    assert torch.allclose(from_6d(to_6d(rotations)), rotations)
-    x = to_6d(rotations) * 3 + 0.05
-    stretched = from_6d(x)
-    np.testing.assert_allclose(rotations_of_6d(x.numpy()), stretched.numpy(), atol=1e-9)
-    assert torch.allclose(stretched.mT @ stretched, torch.eye(3, dtype=torch.float64).expand_as(stretched), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -82,17 +71,6 @@ def test_mirroring_rotations_mirrors_positions() -> None:
     plain, _ = forward_kinematics(rotations, offsets)
     mirrored, _ = forward_kinematics(mirror_rotations(rotations), mirror_offsets(offsets))
     assert torch.allclose(mirrored, mirror_offsets(plain))
-
-
-def test_heading_is_removed_and_given_back() -> None:
-    rotations = random_rotations(3, 8, 22)
-    turned, back = remove_heading(rotations, 3)
-    left = turned[:, 3, 0, :, 1]
-    assert torch.allclose(torch.atan2(-left[:, 0], left[:, 1]), torch.zeros(3, dtype=torch.float64), atol=1e-9)
-    assert torch.allclose(back[:, None] @ turned[:, :, 0], rotations[:, :, 0])
-    spun = rotations.clone()
-    spun[:, :, 0] = yaw_rotation(torch.tensor([1.0], dtype=torch.float64)) @ spun[:, :, 0]
-    assert torch.allclose(remove_heading(spun, 3)[0], turned)
 
 
 def prepared(path: Path, clips: int = 4) -> Path:
