@@ -5,10 +5,10 @@ statement left out. Tests that fail on it kill it. If all of them pass, it survi
 there. Each mutant is printed as killed or survived.
 
 Unless ``--tests`` names the tests, each mutant is tested by the test files in the folder of its file, such as
-``tests/prior/fit`` for ``prior/fit``, and by those that import its module, or, if none does, import a module that
-imports it. Only those that run the changed function are run, the fastest first, without tests marked slow. Mutants are
-written to a temporary copy of the checkout. The exit status is 0 if at least `GOAL` of the mutants were killed, and 1
-if fewer were, or if the tests fail on the unchanged code.
+``tests/prior/fit`` for ``prior/fit``. If none of them imports its module, those elsewhere that do are added, or, if
+there are none, those that import a module that imports it. Only those that run the changed function are run, the
+fastest first, without tests marked slow. Mutants are written to a temporary copy of the checkout. The exit status is 0
+if at least `GOAL` of the mutants were killed, and 1 if fewer were, or if the tests fail on the unchanged code.
 """
 
 from __future__ import annotations

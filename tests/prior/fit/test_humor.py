@@ -10,13 +10,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from torch.distributions import Normal, kl_divergence
 
 from steadypose.benchmarks.motion import as_set, simulated_clips
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
-from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, roll_out, sample, transitions
+from steadypose.prior.fit.hmvae_network import Posterior
+from steadypose.prior.fit.humor_network import Gaussian, HumorConfig, HumorNet, roll_out, sample, transitions
 from steadypose.prior.fit.humor_state import (
     CHANGE,
     State,
@@ -198,3 +200,18 @@ def test_what_ships_tells_motion_of_people_it_has_not_seen(shipped: HumorNet) ->
     nats = float(posterior.kl(prior).mean())
     assert error == pytest.approx(TOLD_MM, rel=0.15)
     assert nats == pytest.approx(NATS, rel=0.15)
+
+
+def test_latents_are_normal_with_means_and_log_variances() -> None:
+    def some(seed: int) -> torch.Tensor:
+        return torch.randn(5, 4, generator=torch.Generator().manual_seed(seed))
+
+    first, second = Gaussian(some(0), some(1)), Gaussian(some(2), some(3))
+    normals = [Normal(each.mean, (0.5 * each.log_variance).exp()) for each in (first, second)]
+    torch.testing.assert_close(first.sigma, normals[0].scale)
+    torch.testing.assert_close(first.kl(second), kl_divergence(*normals).sum(dim=-1))
+    draw = first.sample(torch.Generator().manual_seed(2))
+    torch.testing.assert_close(draw, first.mean + first.sigma * some(2))
+    local, deep = Posterior(first.mean, first.log_variance, second.mean, second.log_variance).kl()
+    unit = [kl_divergence(normal, Normal(0.0, 1.0)).sum(dim=-1).mean() for normal in normals]
+    torch.testing.assert_close([local, deep], unit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from tests.helpers.bodies import waving
 
@@ -103,3 +104,9 @@ def test_joints_and_rotations_to_meet_are_of_one_pose_from_the_root_without_head
     placed = seen.joints @ back.mT[:, None]
     np.testing.assert_allclose(placed.numpy(), (turned - turned[:, :1])[rows], atol=1e-5)
     assert heading(from_6d(seen.columns)[:, WINDOW // 2 - 1, 0]).abs().max() < 1e-5
+
+
+def test_the_weights_that_ship_are_of_this_network(monkeypatch) -> None:
+    assert isinstance(Optimiser.load("default", PartsCompleter(make(monkeypatch)[2])), Optimiser)
+    with pytest.raises(FileNotFoundError, match="default"):
+        Optimiser.load("nobodys", PartsCompleter(make(monkeypatch)[2]))

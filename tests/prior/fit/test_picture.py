@@ -207,3 +207,16 @@ def test_what_is_written_is_in_the_cameras_frame() -> None:
     assert (found["state"] == JointState.REFINED).sum() == FRAMES * 22 - 1
     assert np.isnan(found["sigma"]).all()
     assert not found["anomaly_flag"].any()
+
+
+def test_a_camera_that_stands_elsewhere_sees_the_same_there() -> None:
+    told, away = pixels(person(0.2, 1.1)), np.array([0.5, -0.3, 0.8])
+    moved = Pinhole(camera().focal, camera().centre, camera().rotation, torch.from_numpy(away).float())
+    here, there = (
+        starts_of_key_points(told, taken, REST_OFFSETS, ground, floor_known=True)[0]
+        for taken, ground in ((camera(), -HEIGHT), (moved, away[2] - HEIGHT))
+    )
+    np.testing.assert_allclose(joints_of(there), joints_of(here) + away, atol=1e-4)
+    surface = np.repeat(person(0.2, 1.1), 4, axis=1) - [0.0, 0.05, 0.0]
+    lifted = lift(told, moved, surface + away)
+    np.testing.assert_allclose(lifted, lift(told, camera(), surface) + away, atol=1e-4)
