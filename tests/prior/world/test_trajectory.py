@@ -243,7 +243,7 @@ def test_settings_are_checked():
     assert TrajectorySettings.from_dict({"contacts": False, "timeout_s": 2}).timeout_s == 2.0
     with pytest.raises(ValueError, match="no setting 'speed': expected one of weights"):
         TrajectorySettings.from_dict({"speed": 1})
-    with pytest.raises(ValueError, match=r"contacts: expected bool .*, got 1"):
+    with pytest.raises(ValueError, match="contacts: expected true or false, got 1"):
         TrajectorySettings.from_dict({"contacts": 1})
     with pytest.raises(ValueError, match="above 0"):
         TrajectorySettings.from_dict({"timeout_s": 0})
