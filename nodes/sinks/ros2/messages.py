@@ -30,7 +30,7 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.posture import RootCovariance
 
 if TYPE_CHECKING:
-    from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeSettings
+    from steadypose.nodes.sinks.ros2 import Ros2BridgeSettings
 
 MARKER_LIFE_S = 0.5
 JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
