@@ -12,13 +12,14 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import traceback
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import active_children, get_context
+from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from steadypose.nodes.cli import told_of
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.driving import NOBODY, Settings
 from steadypose.nodes.extras import require_extra
+from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import SUFFIXES
 
@@ -230,34 +232,69 @@ def _failed(error: str) -> dict[str, Any]:
 def on_cores(jobs: Iterable[Job], settings: Settings, cores: int) -> Iterator[tuple[Job, dict[str, Any]]]:
     """Clean recordings in processes of this machine; gives each result as it comes.
 
-    A process that dies, for want of memory or by a fault in a library, takes one recording with it, not the rest: each
-    has a pool of its own.
+    A process that dies, for want of memory or by a fault in a library, takes one recording with it, not the rest.
+    Processes of `multiprocessing` would import modules of the working folder.
     """
     waiting = deque(jobs)
-    idle: list[ProcessPoolExecutor] = []
-    busy: dict[Future[dict[str, Any]], tuple[Job, ProcessPoolExecutor]] = {}
+    idle: list[_Worker] = []
+    busy: dict[Connection, _Worker] = {}
     try:
         while waiting or busy:
             while waiting and len(busy) < cores:
-                pool = idle.pop() if idle else ProcessPoolExecutor(1, get_context("spawn"), _leave_ctrl_c)
-                job = waiting.popleft()
-                busy[pool.submit(work, job, settings)] = job, pool
-            for future in wait(busy, return_when=FIRST_COMPLETED).done:
-                job, pool = busy.pop(future)
-                try:
-                    result = future.result()
-                    idle.append(pool)
-                except BrokenProcessPool:
-                    result = _failed("the process that cleaned it died; if memory was short, give fewer --jobs")
-                yield job, result
+                worker = idle.pop() if idle else _Worker(settings)
+                worker.send(waiting.popleft())
+                busy[worker.connection] = worker
+            for connection in wait(list(busy)):
+                worker = busy.pop(connection)  # type: ignore[index]  (all that is waited for are connections)
+                result = worker.receive()
+                if worker.process.poll() is None:
+                    idle.append(worker)
+                yield worker.job, result
     finally:
-        for process in active_children():
-            process.kill()  # whatever it writes is not in its place before it is whole
+        for worker in [*idle, *busy.values()]:
+            worker.process.kill()  # whatever it writes is not in its place before it is whole
+            worker.process.wait()
 
 
-def _leave_ctrl_c() -> None:
-    """Ctrl-C is for the process that started this one, which ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+class _Worker:
+    """A process that cleans one recording after the other."""
+
+    job: Job
+
+    def __init__(self, settings: Settings) -> None:
+        self.connection, theirs = Pipe()
+        serve = own_command("steadypose.nodes.commands.batch:serve", str(theirs.fileno()))
+        self.process = subprocess.Popen(
+            serve, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=own_environment()
+        )
+        theirs.close()  # so that its end closes with the process
+        with suppress(OSError):
+            self.connection.send(settings)
+
+    def send(self, job: Job) -> None:
+        self.job = job
+        with suppress(OSError):  # if the process has died since its last job, `receive` says so
+            self.connection.send(job)
+
+    def receive(self) -> dict[str, Any]:
+        try:
+            return self.connection.recv()
+        except (EOFError, OSError):
+            self.process.wait()  # so that it is not given another job
+            return _failed("the process that cleaned it died; if memory was short, give fewer --jobs")
+
+
+def serve() -> None:
+    """Clean what comes through a connection, until it is closed."""
+    connection = Connection(int(sys.argv[1]))
+    settings = connection.recv()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one, which ends it
+    while True:
+        try:
+            job = connection.recv()
+        except EOFError:
+            return
+        connection.send(work(job, settings))
 
 
 def _cores() -> int:
