@@ -204,7 +204,12 @@ def test_key_points_cost_pixels_by_confidence_under_geman_and_mcclure() -> None:
     pixels[0, 3], confidence[0, 3] = at + torch.tensor([10.0, 0.0]), 0.6
     pixels[0, 4] = at + 100.0  # without confidence it is not seen
     expected = 0.5 * 0.6 * 4.0 / (1 + 4.0 / 25.0)
-    assert nats(KeyPoints(pixels, confidence, camera, 5.0), world_joints=joints) == pytest.approx(expected)
+    told = KeyPoints(pixels, confidence, camera, 5.0)
+    assert nats(told, world_joints=joints) == pytest.approx(expected)
+    misfit = told.misfit(cast(Motion, SimpleNamespace(world_joints=joints)))
+    assert misfit.shape == (1, JOINTS)
+    assert float(misfit[0, 3]) == pytest.approx(10.0)
+    assert int(misfit.isnan().sum()) == JOINTS - 1
 
 
 def test_points_of_the_surface_are_bisquare_of_both_residuals_together() -> None:
