@@ -2,7 +2,6 @@
 
 STALE = {
     "ablations": "a table of flags came; the other tables are as they were but for legs never observed",
-    "hidden_joints": "the conditional Gaussian smooths first since, and an arm never observed is placed by it too",
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
