@@ -1,7 +1,6 @@
 """Results that are kept although what they measured has changed since, each with the reason."""
 
 STALE = {
-    "ablations": "a table of flags came; the other tables are as they were but for legs never observed",
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
