@@ -16,6 +16,7 @@ STUDIES: dict[str, str] = {
     "world": "root drift and foot skate",
     "contacts": "load of feet, against force plates",
     "humor": "futures, noisy and hidden joints, a simulated detector and depth camera (the HuMoR paper)",
+    "humor_credit": "what a fit owes to HuMoR's transition model and contacts",
     "event_mocap": "events of motion capture whose names say what it holds",
     "ablations": "what each part of the default is worth, and its milliseconds",
 }

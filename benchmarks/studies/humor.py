@@ -30,13 +30,12 @@ from steadypose.benchmarks.studies.humor_fits import (
     Answer,
     camera_settings,
     corrupted,
-    credit,
-    credit_table,
     fitted,
     load_labels,
     pictures,
     scores,
     seen_joints,
+    shipped,
     start_of,
 )
 from steadypose.prior.arrays import Floats
@@ -63,11 +62,6 @@ VARIANTS: Mapping[str, HumorConfig] = {
     MVAE: HumorConfig(learned_prior=False, residual=False, contacts=False),
 }
 """Variants, named as in the paper. Without SMPL, there is one more: joints that need not be those of a body."""
-
-
-def shipped() -> HumorNet:
-    """Return the default weights."""
-    return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")
 
 
 def model_of(bench: Bench, name: str) -> HumorNet:
@@ -182,9 +176,8 @@ DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit", "training.recipes.humor")
 FRAMES = 90
 DELAY = 8
 """Delay of the live output from which fits start, frames."""
-CLIPS, PICTURES, FUTURES, CREDIT = 4, 8, 12, 16
-"""Number of clips of Table 2, of Tables 3 and 4, of Table 1, and of `credit`, taken evenly from all sources of the
-split."""
+CLIPS, PICTURES, FUTURES = 4, 8, 12
+"""Number of clips of Table 2, of Tables 3 and 4, and of Table 1, taken evenly from all sources of the split."""
 
 _STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
 _PER_FRAME = "per-frame fit, smoothed (stage 2)"
@@ -206,10 +199,7 @@ def run(bench: Bench) -> Result:
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
     few = len(clips.offsets)
-    clips = bench.clips(FRAMES, 2 if bench.quick else CREDIT)
-    owed = credit(bench, models[SHIPS], clips)
     records = {
-        "credit": owed,
         "futures": futures,
         "noisy": noisy,
         "hidden": hidden,
@@ -217,7 +207,7 @@ def run(bench: Bench) -> Result:
         "depth": depth,
     }
     return Result(
-        [_futures_table(futures, count), credit_table(owed, len(clips.offsets)), *_fit_tables(records, few)],
+        [_futures_table(futures, count), *_fit_tables(records, few)],
         {"data": clips.source, "records": records},
     )
 

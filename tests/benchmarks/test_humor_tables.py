@@ -12,7 +12,7 @@ from rich.progress import Progress
 
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
-from steadypose.benchmarks.studies import humor
+from steadypose.benchmarks.studies import humor, humor_credit
 from steadypose.benchmarks.studies import humor_fits as fits
 from steadypose.benchmarks.studies.humor import MVAE, SHIPS, VARIANTS
 from steadypose.benchmarks.studies.humor_fits import Answer, load_labels, pictures, scores
@@ -61,26 +61,32 @@ def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(humor, "VARIANTS", {name: VARIANTS[name] for name in ("no contacts", MVAE)})
     for module in (humor, fits):
         monkeypatch.setattr(module, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
-    brief = {
-        name: replace(one, root_steps=0, pose_steps=10, motion_steps=10) for name, one in fits.CREDIT_VARIANTS.items()
-    }
-    monkeypatch.setattr(fits, "CREDIT_VARIANTS", brief)
-    monkeypatch.setattr(fits, "SMOOTH", (4.0,))
     with Progress(disable=True) as progress:
         result = humor.run(Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress))
     assert [table.name for table in result.tables] == [
-        "humor-futures", "humor-credit", "humor-noisy", "humor-hidden", "humor-detector", "humor-depth",
+        "humor-futures", "humor-noisy", "humor-hidden", "humor-detector", "humor-depth",
     ]  # fmt: skip
     for table in result.tables:
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert any(row[0] in (SHIPS, "4 cm of noise: as it ships") for row in table.rows)
-    owed = {(record["condition"], record["method"]): record for record in result.data["records"]["credit"]}
-    assert owed["4 cm of noise", fits.AS_IT_SHIPS]["more_mm"][0] == 0.0
-    for (condition, _), record in owed.items():
-        more = np.subtract(record["clips_mm"], owed[condition, fits.AS_IT_SHIPS]["clips_mm"])
-        assert record["mm"][0] == pytest.approx(np.mean(record["clips_mm"]), abs=0.01)
-        assert record["more_mm"][0] == pytest.approx(np.mean(more), abs=0.01)
-    assert len({str(record["clips_mm"]) for record in owed.values()}) == len(owed) == 8
     noisy = {record["method"]: record for record in result.data["records"]["noisy"]}
     assert noisy[SHIPS]["all_mm"] < noisy["as seen"]["all_mm"]
     assert noisy["truth"]["all_mm"] == 0.0
+
+
+def test_what_a_fit_owes_to_the_model_is_paired_by_clip(tmp_path: Path, monkeypatch) -> None:
+    def brief(settings: FitSettings) -> FitSettings:
+        return replace(settings, root_steps=0, pose_steps=10, motion_steps=10)
+
+    monkeypatch.setattr(humor_credit, "FitSettings", lambda **given: brief(FitSettings(**given)))
+    monkeypatch.setattr(humor_credit, "VARIANTS", {name: brief(one) for name, one in humor_credit.VARIANTS.items()})
+    monkeypatch.setattr(humor_credit, "SMOOTH", (4.0,))
+    with Progress(disable=True) as progress:
+        result = humor_credit.run(Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress))
+    owed = {(record["condition"], record["method"]): record for record in result.data["records"]}
+    assert owed["4 cm of noise", humor_credit.AS_IT_SHIPS]["more_mm"][0] == 0.0
+    for (condition, _), record in owed.items():
+        more = np.subtract(record["clips_mm"], owed[condition, humor_credit.AS_IT_SHIPS]["clips_mm"])
+        assert record["mm"][0] == pytest.approx(np.mean(record["clips_mm"]), abs=0.01)
+        assert record["more_mm"][0] == pytest.approx(np.mean(more), abs=0.01)
+    assert len({str(record["clips_mm"]) for record in owed.values()}) == len(owed) == 8
