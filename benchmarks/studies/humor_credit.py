@@ -1,5 +1,7 @@
-"""What a fit owes to HuMoR: the same fit without its transition model and contacts, paired by clip, and a stage 2 that is
-tuned as hard."""
+"""What a fit owes to HuMoR: the same fit without its transition model and contacts, paired by clip.
+
+A stage 2 with the steps of both stages is searched as hard.
+"""
 
 from __future__ import annotations
 
