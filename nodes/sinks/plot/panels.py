@@ -306,7 +306,7 @@ def draw_by_joint(ax: Axes, clean: Track | None, errors: dict[str, TrackError]) 
     if errors:
         title = "by joint: mean distance from the truth, cm"
         bars = {topic.removeprefix("pose/"): (error.by_joint, TOPIC_COLOURS[topic]) for topic, error in errors.items()}
-    elif clean is not None:
+    elif clean is not None and np.isfinite(corrections(clean)).any():
         title = "by joint: mean correction, cm"
         bars = {"correction": (nan_mean(corrections(clean), axis=0), CLEAN_COLOUR)}
     else:

@@ -11,6 +11,7 @@ from tests.nodes.conftest import record, walk
 from steadypose.msgs.types import JointState, PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.commands.complete import complete
+from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import history_of_path
 from steadypose.nodes.sinks.plot.video import View, write_video
 from steadypose.nodes.sources.recording import open_recording
@@ -68,6 +69,13 @@ def test_it_is_completed_where_it_was_imputed(cleaned: Path, name: str, tmp_path
 def test_it_is_drawn(cleaned: Path, name: str, tmp_path: Path) -> None:
     assert main(["plot", str(cleaned / name), "-o", str(tmp_path / "picture.png")]) == 0
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_arrays_without_what_was_observed_show_no_corrections(cleaned: Path) -> None:
+    shown = {name: [ax.get_title("left") for ax in draw(history_of_path(cleaned / name)).axes if ax.axison]
+             for name in ("walk", "walk.npz")}  # fmt: skip
+    assert "by joint: mean correction, cm" in shown["walk"]
+    assert "by joint: mean correction, cm" not in shown["walk.npz"]
 
 
 def test_info_says_what_is_in_it(cleaned: Path, capsys) -> None:

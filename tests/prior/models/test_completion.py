@@ -17,9 +17,7 @@ from steadypose.prior.models.hgvae.live_completion import (
     Features,
     completion_features,
 )
-from steadypose.training.data.hgvae_windows import Windows
 from steadypose.training.networks.graph import CompletionNet, certainty_of
-from steadypose.training.recipes.hgvae import completion_recipe
 
 WRIST = J["left_wrist"]
 TRACKS = slice(3 * WRIST, 3 * WRIST + 3)
@@ -153,9 +151,7 @@ def test_windows_come_in_whole_patches() -> None:
         CompletionNet(12, CompletionConfig(patch=5))
 
 
-def test_without_a_network_the_guess_stays_and_there_is_nothing_to_train() -> None:
+def test_without_a_network_the_guess_stays() -> None:
     model = awake(replace(SMALL, completion=None))
     x, observed = torch.ones(1, 66, 12), torch.zeros(1, 66, 12)
     assert model.completed(x, observed, 0.0) == (x, observed)
-    with pytest.raises(ValueError, match="completion"):
-        completion_recipe(model, Windows(None), Windows(None))  # type: ignore[arg-type]
