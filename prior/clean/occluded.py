@@ -33,7 +33,8 @@ this correction 0.9 to 1.1 (validation)."""
 _LEGS, _UNSEEN_LEG = limbs(("knee", "ankle", "foot")), 1.4
 _ARMS, _UNSEEN_ARM = limbs(("shoulder", "elbow", "wrist")), 1.6
 """Limbs, and factors on the completion's deviation for the joints below a leg's hip and an arm's shoulder if no joint
-of that limb was ever observed: error-to-sigma ratios of validation people, none of whose source was trained on."""
+of that limb was ever observed. Without them, the error-to-sigma ratio on validation people is 1.4 for legs, 1.46 for
+elbows and 1.73 for wrists."""
 
 _OF_ARMS = np.isin(np.arange(22), np.ravel(_ARMS))
 
@@ -143,7 +144,7 @@ class OccludedJoints:
         average(self._past, slots, never, completed, held)
         placed = held.copy()
         stand(never, seen, unseen_s, placed)
-        self._place_arms(never, np.where(np.isfinite(held), held, completed), sigma, unseen_s, offsets, placed)
+        self._place_arms(never, held, completed, sigma, unseen_s, offsets, placed)
         bridged, bridged_sigma = seen.copy(), sigma.copy()
         _bridge(slots, occluded & seen_later, *track, bridged, bridged_sigma)
         candidates, sigmas = (seen, completed, held, bridged), (completed_sigma, bridged_sigma)
@@ -157,7 +158,14 @@ class OccludedJoints:
         )
 
     def _place_arms(
-        self, never: Bools, positions: Floats, sigma: Floats, unseen_s: Floats, offsets: Floats, placed: Floats
+        self,
+        never: Bools,
+        held: Floats,
+        completed: Floats,
+        sigma: Floats,
+        unseen_s: Floats,
+        offsets: Floats,
+        placed: Floats,
     ) -> None:
         """Move joints of arms that were ``never`` (B, 22) observed, ``placed`` (B, 22, 3), towards their expectation
         given the observed joints, in the Gaussian of postures."""
@@ -165,7 +173,8 @@ class OccludedJoints:
         rows = np.flatnonzero(arms.any(axis=1))
         if len(rows):
             known = np.where(unseen_s[rows] == 0.0, sigma[rows], np.inf)
-            expected = self._posture(positions[rows], known, offsets[rows]).positions
+            positions = np.where(np.isfinite(held[rows]), held[rows], completed[rows])
+            expected = self._posture(positions, known, offsets[rows]).positions
             placed[rows] += np.where(arms[rows], POSTURE_SHARE, 0.0)[..., None] * (expected - placed[rows])
 
     def _weigh(
