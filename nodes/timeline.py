@@ -1,4 +1,4 @@
-"""The events of a whole stream, each once, with its begin and end."""
+"""Events with begin and end: those of each frame, and those of a whole stream, each once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld
+from steadypose.msgs.types import EventKind, Hand, Phase, PoseWorld
 from steadypose.prior.events.detector import NOWHERE, EventDetector, EventSettings
 
 
@@ -22,11 +22,64 @@ class TimedEvent(NamedTuple):
     begin_ns: int
     """capture time at which it began, nanoseconds"""
     end_ns: int
-    """capture time at which it was seen to have ended, or the stream ended; for ENTERED and LEFT, as `begin_ns`"""
+    """capture time at which it was seen to have ended; of the newest frame, while it holds; for ENTERED and LEFT, as
+    `begin_ns`"""
     confidence: float
     """0 to 1: probability of the event's condition when it began"""
     direction: NDArray[np.float64]
     """(3,) direction of POINTS when it began: unit vector, world; zeros for other events"""
+    phase: Phase
+    """what it does in the newest frame: it begins, holds or ends; ENTERED and LEFT begin and are over. In the events of
+    a whole stream, HOLDS if the stream ended first"""
+
+
+_Key = tuple[int, EventKind, Hand]
+_MOMENTS = (EventKind.ENTERED, EventKind.LEFT)
+
+
+class FrameEvents:
+    """Detects the events of each frame of one stream, with begin and end.
+
+    Args:
+        settings: the thresholds.
+    """
+
+    def __init__(self, settings: EventSettings | None = None) -> None:
+        self._detector = EventDetector(settings)
+        self._open: dict[_Key, TimedEvent] = {}
+        self._stamp_ns = -1
+
+    def update(
+        self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False
+    ) -> list[TimedEvent]:
+        """Return the events that begin, hold or end with the next message of ``pose/world``.
+
+        An event holds until it is seen to have ended, so also while its body is hidden for a moment.
+
+        Args:
+            world: the message.
+            sensor: as of `EventDetector.update`.
+            calibrated: as of `EventDetector.update`.
+        """
+        now = world.stamp_ns
+        if world.end_of_stream or now <= self._stamp_ns:
+            self._open.clear()
+        self._stamp_ns = now
+        self._open = {key: event._replace(end_ns=now, phase=Phase.HOLDS) for key, event in self._open.items()}
+        over: list[TimedEvent] = []
+        for event in self._detector.update(world, sensor, calibrated=calibrated):
+            key = event.body, event.kind, event.hand
+            if event.phase == Phase.ENDS:
+                over.append(self._open.pop(key)._replace(phase=Phase.ENDS))
+            elif event.phase == Phase.BEGINS:
+                end_ns = event.since_ns if event.kind in _MOMENTS else now
+                direction = np.array(event.direction)
+                begun = TimedEvent(*key, event.since_ns, end_ns, event.confidence, direction, Phase.BEGINS)
+                if event.kind in _MOMENTS:
+                    over.append(begun)
+                else:
+                    self._open[key] = begun
+        return [*over, *self._open.values()]
 
 
 class EventTimeline:
@@ -37,36 +90,20 @@ class EventTimeline:
     """
 
     def __init__(self, settings: EventSettings | None = None) -> None:
-        self._detector = EventDetector(settings)
-        self._ended: list[TimedEvent] = []
-        self._open: dict[tuple[int, EventKind, Hand], Event] = {}
-        self._stamp_ns = -1
+        self._frames = FrameEvents(settings)
+        self._events: list[TimedEvent] = []
+        self._newest: dict[_Key, int] = {}
 
     def add(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False) -> None:
-        """Add the next message of ``pose/world``; arguments as of `EventDetector.update`."""
-        if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
-            self._close_all()
-        self._stamp_ns = world.stamp_ns
-        for event in self._detector.update(world, sensor, calibrated=calibrated):
-            key = event.body, event.kind, event.hand
-            if event.kind in (EventKind.ENTERED, EventKind.LEFT):
-                self._ended.append(_timed(event, event.since_ns))
-            elif event.phase == Phase.BEGINS:
-                self._open[key] = event
-            elif event.phase == Phase.ENDS:
-                self._ended.append(_timed(self._open.pop(key), world.stamp_ns))
+        """Add the next message of ``pose/world``; arguments as of `FrameEvents.update`."""
+        for event in self._frames.update(world, sensor, calibrated=calibrated):
+            key = event[:3]
+            if event.phase == Phase.BEGINS:
+                self._newest[key] = len(self._events)
+                self._events.append(event)
+            else:
+                self._events[self._newest[key]] = event
 
     def events(self) -> list[TimedEvent]:
         """All events so far, by begin. Those that have not ended last until the newest message."""
-        self._close_all()
-        return sorted(self._ended, key=lambda event: (event.begin_ns, event.body))
-
-    def _close_all(self) -> None:
-        self._ended += (_timed(event, self._stamp_ns) for event in self._open.values())
-        self._open.clear()
-
-
-def _timed(event: Event, end_ns: int) -> TimedEvent:
-    return TimedEvent(
-        event.body, event.kind, event.hand, event.since_ns, end_ns, event.confidence, np.array(event.direction)
-    )
+        return sorted(self._events, key=lambda event: (event.begin_ns, event.body))

@@ -69,8 +69,8 @@ def _callers_level() -> int:
     return level
 
 
-def sections(settings: Settings | None, delay: int, known: Sequence[str] = ("prior", "trajectory")) -> Settings:
-    """The sections ``known``; a delay in ``settings`` takes precedence over ``delay``.
+def sections(settings: Settings | None, delay: int) -> Settings:
+    """The sections of `PIPELINES`; a delay in ``settings`` takes precedence over ``delay``.
 
     Raises:
         LaunchError: ``settings`` has another section, or a setting cannot be used.
@@ -78,13 +78,14 @@ def sections(settings: Settings | None, delay: int, known: Sequence[str] = ("pri
     given: Settings = {} if settings is None else settings
     named = given if isinstance(given, Mapping) else {given: None}
     for name, part in named.items():
-        if name not in known or not isinstance(part, Mapping):
-            got = f"{name} = {part!r}" if name in known else f"{name!r}{nearest(str(name).partition('.')[0], known)}"
+        if name not in PIPELINES or not isinstance(part, Mapping):
+            hint = nearest(str(name).partition(".")[0], PIPELINES)
+            got = f"{name} = {part!r}" if name in PIPELINES else f"{name!r}{hint}"
             raise LaunchError(
-                f"settings: expected sections {' and '.join(map(repr, known))}, each with its settings, such as "
+                f"settings: expected sections {', '.join(map(repr, PIPELINES))}, each with its settings, such as "
                 f"{{'prior': {{'delay': 2}}}}; got {got}"
             )
-    found = {name: dict(given.get(name, {})) for name in known}
+    found = {name: dict(given.get(name, {})) for name in PIPELINES}
     found["prior"] = {"delay": delay} | found["prior"]
     check_settings(found)
     return found
@@ -202,7 +203,7 @@ def clean(
         InputWarning: units, axes or joint order are probably wrong. The texts are also in ``problems``.
     """
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    checked = sections(settings, delay, PIPELINES)
+    checked = sections(settings, delay)
     timeline = EventTimeline(build_settings(EventSettings, checked["events"], "events"))
     compile_loops()
     run = OfflineRun(source, checked, timeline)

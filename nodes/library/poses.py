@@ -83,7 +83,6 @@ class Poses(dict[str, NDArray[Any]]):
     Attributes:
         problems: probable faults of the input, as text, with the remedy.
         refused: counts of unused frames, bodies and joints, by cause.
-        events: what the people do, each event once, by begin. Only `clean` gives it.
     """
 
     def __init__(
@@ -91,10 +90,10 @@ class Poses(dict[str, NDArray[Any]]):
         arrays: Mapping[str, NDArray[Any]],
         problems: Iterable[str] = (),
         refused: Mapping[str, int] | None = None,
-        events: Iterable[TimedEvent] = (),
+        events: Iterable[TimedEvent] | None = None,
     ) -> None:
         super().__init__(arrays)
-        self.events: tuple[TimedEvent, ...] = tuple(events)
+        self._events = None if events is None else tuple(events)
         self.problems: tuple[str, ...] = tuple(problems)
         self.refused: dict[str, int] = dict(refused or {})
 
@@ -159,6 +158,19 @@ class Poses(dict[str, NDArray[Any]]):
         return self["root_velocity"]
 
     @property
+    def events(self) -> tuple[TimedEvent, ...]:
+        """What the people do. Of `clean`, each event once, by begin; of a `Filter`, what begins, holds or ends now.
+
+        Raises:
+            AttributeError: nobody looked for events.
+        """
+        if self._events is None:
+            raise AttributeError(
+                "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
+            )
+        return self._events
+
+    @property
     def body_id(self) -> NDArray[np.int32]:
         """(B,) ids of the bodies; only 0 if the input has no axis of bodies."""
         return self.get("body_id", np.zeros(1, np.int32))
@@ -174,7 +186,8 @@ class Poses(dict[str, NDArray[Any]]):
         bodies = {}
         for row, id in enumerate(self["body_id"].tolist()):
             arrays = common | {name: self[name].take(row, axis) for name in own}
-            bodies[id] = Poses(arrays, self.problems, self.refused, (e for e in self.events if e.body == id))
+            events = None if self._events is None else (event for event in self._events if event.body == id)
+            bodies[id] = Poses(arrays, self.problems, self.refused, events)
         return bodies
 
     def to_dict(self) -> dict[str, NDArray[Any]]:

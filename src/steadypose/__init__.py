@@ -20,7 +20,10 @@ if TYPE_CHECKING:
         JOINTS,
         CleanBody,
         Diagnostics,
+        EventKind,
+        Hand,
         JointState,
+        Phase,
         Pose,
         PoseClean,
         PoseRaw,
@@ -43,9 +46,12 @@ __all__ = [
     "SKELETONS",
     "CleanBody",
     "Diagnostics",
+    "EventKind",
     "Filter",
+    "Hand",
     "InputWarning",
     "JointState",
+    "Phase",
     "Pose",
     "PoseClean",
     "PoseRaw",
@@ -68,8 +74,8 @@ PACKAGE = Path(__file__).parent
 """Folder of this package, which contains launch files, weights and a sample stream."""
 
 _MESSAGES = (
-    *("CONTACTS", "JOINTS", "CleanBody", "Diagnostics", "JointState", "Pose", "PoseClean", "PoseRaw", "PoseWorld"),
-    *("RawBody", "Tracking", "WorldBody"),
+    *("CONTACTS", "JOINTS", "CleanBody", "Diagnostics", "EventKind", "Hand", "JointState", "Phase", "Pose"),
+    *("PoseClean", "PoseRaw", "PoseWorld", "RawBody", "Tracking", "WorldBody"),
 )
 _MODULES = {
     **dict.fromkeys(_MESSAGES, "msgs.types"),

@@ -98,7 +98,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "a section that there is not": (
         lambda j: steadypose.Filter(settings={"prior.delay": 2}),  # type: ignore[arg-type]
-        r"expected sections 'prior' and 'trajectory'.*got 'prior\.delay', did you mean 'prior'",
+        r"expected sections 'prior', 'trajectory', 'events'.*got 'prior\.delay', did you mean 'prior'",
     ),
     "a rate and stamps": (
         lambda j: steadypose.clean(j, fps=30, stamp_ns=np.arange(FRAMES) * 33_333_333),
