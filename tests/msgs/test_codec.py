@@ -28,7 +28,7 @@ TOPIC_NAMES = st.sampled_from(list(TOPICS))
 
 
 @given(ANY)
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_round_trip(sent: tuple[str, Message]):
     topic, message = sent
     assert decode(topic, encode(message)) == message

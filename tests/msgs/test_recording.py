@@ -305,7 +305,7 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path):
 
 
 @given(data=st.data())
-@settings(max_examples=30)
+@settings(max_examples=20)
 def test_one_flipped_bit_costs_one_chunk_at_most(
     data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
 ):

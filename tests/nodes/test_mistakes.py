@@ -240,8 +240,8 @@ def test_the_command_answers_with_what_to_do(mistake: str, tmp_path: Path, monke
 def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        poses = steadypose.clean(joints.tolist(), fps=30)
-        frame_by_frame(joints, seconds())
+        poses = steadypose.clean(joints[:25].tolist(), fps=30)
+        frame_by_frame(joints[:25], seconds()[:25])
     assert poses.problems == ()
     assert np.isfinite(poses.positions).all()
 

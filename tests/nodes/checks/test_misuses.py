@@ -250,12 +250,12 @@ class TestNode:
         assert news.message == news.values["problem.unknown_skeleton"]
 
     def test_a_tracker_that_stops(self, node: PriorNode, clock: VirtualClock) -> None:
-        self.play(node, clock, walk())
+        self.play(node, clock, walk(1.0))
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "restart it" in from_values(node.diagnostics().values)["stopped"]
 
     def test_a_stream_that_ended_has_not_stopped(self, node: PriorNode, clock: VirtualClock) -> None:
-        frames = walk()
+        frames = walk(1.0)
         self.play(node, clock, [*frames, dataclasses.replace(frames[-1], bodies=[], end_of_stream=True)])
         clock.time_ns += 60 * SECOND_NS
         assert node.diagnostics().level == Level.OK
@@ -321,7 +321,7 @@ def _named(raw: PoseRaw, skeleton: str) -> PoseRaw:
 
 
 @given(st.lists(of(PoseRaw), min_size=1, max_size=4), st.sampled_from([*SKELETONS, None]), st.booleans())
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=30)
 def test_whatever_comes_is_survived(raws: list[PoseRaw], skeleton: str | None, live: bool) -> None:
     check = StreamCheck(2)
     for index in range(30):

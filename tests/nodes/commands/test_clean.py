@@ -21,7 +21,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
 
-FRAMES = 40
+FRAMES = 25
 
 
 def load(path: Path) -> dict[str, np.ndarray]:

@@ -23,6 +23,8 @@ from steadypose.nodes.sources.recording import open_recording
 GOLDEN = Path(__file__).with_name("golden.npz")
 STREAMS = Path(__file__).parents[3] / "sim_data"
 NAMES = sorted(path.name for path in STREAMS.iterdir() if path.is_dir())
+LIKE_ANOTHER = ("idle", "reach", "sit_rise")
+"""of one person and without what the others show"""
 FRAMES = {"crossing": (60, 180), "leave_reenter": (200, 310)}
 """where people hide each other, or come into sight; of others the first 90"""
 EVERY = 10
@@ -45,7 +47,9 @@ def outcome(name: str) -> dict[str, NDArray[np.float32]]:
     return found
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LIKE_ANOTHER else ()) for name in NAMES]
+)
 def test_a_stream_comes_out_as_it_did(name: str) -> None:
     with np.load(GOLDEN) as golden:
         for part, found in outcome(name).items():

@@ -58,7 +58,7 @@ def drawn(recording: Path) -> bool:
 )
 @pytest.mark.filterwarnings("error")
 def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
-    assert drawn(record(tmp_path / "bag", 3.0, topics))
+    assert drawn(record(tmp_path / "bag", 1.0, topics))
 
 
 @pytest.mark.slow

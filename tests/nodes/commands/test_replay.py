@@ -20,7 +20,7 @@ from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sinks.recorder import RecorderNode
 from steadypose.nodes.sources.pose_input import PoseInputNode
 
-FRAMES = 40
+FRAMES = 30
 NODES = '["pose_input", "prior", "trajectory", "recorder"]'
 
 

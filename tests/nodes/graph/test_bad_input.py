@@ -22,9 +22,9 @@ from steadypose.nodes.driving import stream
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 
-FRAMES, BAD = 58, 15
+FRAMES, BAD = 46, 10
 BASE = walk(FRAMES)
-SHORT, BEFORE, SPOILT = BASE[:17], 6, 3
+SHORT, BEFORE, SPOILT = BASE[:14], 5, 3
 """a short stream, in which so many good frames come before so many bad ones"""
 Spoil = Callable[[PoseRaw], PoseRaw]
 
@@ -172,7 +172,7 @@ def test_one_bad_frame_is_over_within_a_second(kind: str, reference: dict[int, P
         for stamp, world in found.items()
         if stamp > after
     }
-    assert len(off) > 10
+    assert len(off) >= 4
     assert max(off.values()) < 0.1
 
 
@@ -227,7 +227,7 @@ STAMP_STEPS = st.sampled_from([33_333_333] * 12 + [0, 1, 10_000_000, -33_333_333
 def evil_frames(draw: st.DrawFn) -> list[PoseRaw]:
     """Good frames, among which some have any number anywhere, any pose of the sensor, any number of bodies."""
     stamp, frames = BASE[0].stamp_ns, []
-    for k in range(draw(st.integers(8, 24))):
+    for k in range(draw(st.integers(8, 16))):
         stamp += draw(STAMP_STEPS)
         frame = BASE[k]
         bodies = list(frame.bodies)

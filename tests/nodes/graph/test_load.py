@@ -254,13 +254,13 @@ def test_the_nearest_bodies_stay() -> None:
 @pytest.mark.parametrize("lost", [3, 10, 40])
 def test_a_gap_of_our_own_making_resets_no_body(lost: int) -> None:
     prior = PriorPipeline(PriorSettings.from_dict(SIMPLE))
-    frames, before = walk(60 + lost + 20), []
-    for frame in frames[:60]:
+    frames, before = walk(45 + lost + 20), []
+    for frame in frames[:45]:
         before = prior.process(frame)
     bones = before[-1].bodies[0].bone_lengths
-    after = prior.process(frames[60 + lost], gap=True)
+    after = prior.process(frames[45 + lost], gap=True)
     assert len(after) <= CATCH_UP, "what was dropped is not computed after all"
-    for frame in frames[60 + lost + 1 :]:
+    for frame in frames[45 + lost + 1 :]:
         after = prior.process(frame)
     assert not prior.counters["stream_gap"]
     assert after[-1].bodies[0].id == before[-1].bodies[0].id

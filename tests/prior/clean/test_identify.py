@@ -168,7 +168,7 @@ def test_the_pipeline_gives_unnumbered_bodies_ids_and_passes_a_trackers_on() -> 
     def run(**settings: object) -> list[set[int]]:
         pipeline = PriorPipeline(PriorSettings.from_dict(settings))
         messages = []
-        for index in range(60):
+        for index in range(40):
             bodies = [SHORT[index], TALL[index] + [1.5, 0.0, 0.0]]
             if index % 2:
                 bodies.reverse()

@@ -11,7 +11,7 @@ from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 ARM = [J["left_elbow"], J["left_wrist"]]
 
 
-def hidden_arm(frames: int = 90, start: int = 50) -> np.ndarray:
+def hidden_arm(frames: int = 70, start: int = 50) -> np.ndarray:
     seen = waving(frames)
     seen[start:, ARM] = np.nan
     return seen
@@ -39,7 +39,7 @@ def test_beside_a_gap_the_mean_of_some_frames_is_carried_and_none_beyond_the_nex
 
 
 def test_a_hidden_arm_is_imputed_better_than_held_and_marked() -> None:
-    bodies, truth = clean_bodies(hidden_arm(), delay=0), waving(90)[:, ARM]
+    bodies, truth = clean_bodies(hidden_arm(), delay=0), waving(70)[:, ARM]
     held = np.linalg.norm(truth[51:65] - truth[49], axis=-1).mean()
     found = np.array([b.positions[ARM] for b in bodies])
     assert np.linalg.norm(found - truth, axis=-1)[51:65].mean() < held
@@ -50,9 +50,9 @@ def test_a_hidden_arm_is_imputed_better_than_held_and_marked() -> None:
 
 
 def test_other_bodies_do_not_change_what_is_imputed() -> None:
-    alone = clean_bodies(hidden_arm(70), delay=0)
-    messages = stream(hidden_arm(70))
-    for message, other in zip(messages, stream(waving(70) + [2.0, 0.0, 0.0]), strict=True):
+    alone = clean_bodies(hidden_arm(45, 30), delay=0)
+    messages = stream(hidden_arm(45, 30))
+    for message, other in zip(messages, stream(waving(45) + [2.0, 0.0, 0.0]), strict=True):
         body = other.bodies[0]
         body.id = 5
         body.positions[ARM] = np.nan
@@ -63,10 +63,10 @@ def test_other_bodies_do_not_change_what_is_imputed() -> None:
 
 def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
     refined = {"impute": {"enabled": False}, "refine": {"enabled": True}}
-    off = clean_bodies(hidden_arm(65), delay=0, **refined, score={"enabled": False})
-    scored = clean_bodies(hidden_arm(65), delay=0, **refined)
+    off = clean_bodies(hidden_arm(45, 30), delay=0, **refined, score={"enabled": False})
+    scored = clean_bodies(hidden_arm(45, 30), delay=0, **refined)
     assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
-    assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[50:])
+    assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[30:])
 
 
 def test_keys_of_the_version_before_are_ignored_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:

@@ -12,7 +12,7 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-FRAMES = 60
+FRAMES = 40
 OPTICAL = Rotation.from_quat(Pose.from_up("-y").orientation)
 
 

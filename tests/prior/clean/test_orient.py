@@ -10,7 +10,7 @@ from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 
-FRAMES, SETTLED = 60, 20
+FRAMES, SETTLED = 45, 20
 
 
 def _bodies(positions: np.ndarray, orient: bool) -> list[CleanBody]:

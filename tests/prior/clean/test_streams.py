@@ -75,9 +75,9 @@ def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
     settings = {"identify": {"enabled": identify, "birth": 0.1}}
     hour_ns = 3600 * 10**9
     kiosks = {
-        "a": kiosk("a", 40, bodies=2, way_ns=0),
-        "bb": kiosk("bb", 40, clock_ns=hour_ns - hour_ns % PERIOD_NS, way_ns=0),
-        "ccc": kiosk("ccc", 30, bodies=2, clock_ns=-5 * PERIOD_NS, way_ns=0, phase_ns=4 * PERIOD_NS),
+        "a": kiosk("a", 28, bodies=2, way_ns=0),
+        "bb": kiosk("bb", 28, clock_ns=hour_ns - hour_ns % PERIOD_NS, way_ns=0),
+        "ccc": kiosk("ccc", 20, bodies=2, clock_ns=-5 * PERIOD_NS, way_ns=0, phase_ns=4 * PERIOD_NS),
     }
     ended = {name: [*arrivals, end(arrivals)] for name, arrivals in kiosks.items()}
     answers, batch = serve(*ended.values(), **settings)
@@ -105,14 +105,14 @@ def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
 
 def test_frames_at_any_time_and_a_clock_that_drifts() -> None:
     """Streams out of step are answered every frame, about when it was captured by their own clocks."""
-    fast = kiosk("fast", 120, phase_ns=12_000_000)
+    fast = kiosk("fast", 80, phase_ns=12_000_000)
     fast = [(now, dataclasses.replace(m, stamp_ns=m.stamp_ns + round(1e-4 * (now - NOW_NS)))) for now, m in fast]
-    slow = kiosk("slower", 120, phase_ns=25_000_000)
+    slow = kiosk("slower", 80, phase_ns=25_000_000)
     answers, batch = serve(fast, slow)
     assert not batch.counters.total()
     for name, arrivals in (("fast", fast), ("slower", slow)):
         stamps = np.array([c.stamp_ns for c in answers[name]])
-        assert len(stamps) >= 112
+        assert len(stamps) >= 72
         assert (np.abs(np.diff(stamps) - PERIOD_NS) < 0.01 * PERIOD_NS).all()
         first_ns, last_ns = arrivals[0][1].stamp_ns, arrivals[-1][1].stamp_ns
         assert first_ns - 11_000_000 <= stamps[0]
@@ -178,19 +178,19 @@ def test_messages_that_change_places_are_dropped_and_counted() -> None:
 
 @pytest.mark.parametrize(
     ("clock_ns", "way_ns", "until"),
-    [(-400_000_000, 0, 90), (400_000_000, 0, 31), (0, 150_000_000, 90)],
+    [(-400_000_000, 0, 70), (400_000_000, 0, 31), (0, 150_000_000, 70)],
     ids=["clock set back", "one stamp ahead", "way became longer"],
 )
 def test_who_would_be_late_for_ever_starts_anew(clock_ns: int, way_ns: int, until: int) -> None:
     """The offset between clocks is the least seen: it would take half an hour to let go of one that is wrong."""
     spoiled = [
         (now + way_ns, dataclasses.replace(m, stamp_ns=m.stamp_ns + clock_ns)) if 30 <= k < until else (now, m)
-        for k, (now, m) in enumerate(kiosk("other", 90))
+        for k, (now, m) in enumerate(kiosk("other", 70))
     ]
-    answers, batch = serve(kiosk("good", 90), spoiled)
-    assert len(answers["good"]) >= 82
+    answers, batch = serve(kiosk("good", 70), spoiled)
+    assert len(answers["good"]) >= 62
     assert batch.counters["stream_late"] == 1
-    assert [len(clean.bodies) for clean in answers["other"][-20:]] == [1] * 20
+    assert [len(clean.bodies) for clean in answers["other"][-10:]] == [1] * 10
     assert 0 < batch.counters["late_for_batch"] + batch.counters["stamp_out_of_order"] < 35
 
 
