@@ -224,7 +224,6 @@ def test_a_subscriber_that_never_reads_neither_blocks_nor_fills_its_publisher(en
         assert held < 200
 
 
-@pytest.mark.usefixtures("small_buffers")
 def test_who_is_reliable_is_waited_for_and_nobody_else(endpoint: str):
     with (
         Publisher(endpoint, reliable={"slow"}) as publisher,
@@ -235,16 +234,16 @@ def test_who_is_reliable_is_waited_for_and_nobody_else(endpoint: str):
         assert publisher.wait_for_subscribers(["self-appointed", "deaf"], timeout_s=SOON_S)
         assert publisher.wait_for_subscribers(["slow"], timeout_s=SOON_S)
         received, waits = [], 0
-        for stamp in range(150):
+        for stamp in range(300):
             message = dataclasses.replace(BIG, stamp_ns=stamp)
             while not publisher.publish(POSE_RAW, message, timeout_s=0):
                 waits += 1
                 got = slow.receive(SOON_S)
                 assert got
                 received.append(got[1].stamp_ns)
-        received += stamps_until(slow, 149)
+        received += stamps_until(slow, 299)
         assert waits > 0
-        assert received == list(range(150))
+        assert received == list(range(300))
         assert not slow.dropped
 
 
