@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.msgs.types import CleanBody, JointState, Pose, PoseRaw, RawBody, Tracking, WorldBody
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 PERIOD_NS = 33_333_333
+UNTURNED = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1))
 LEAVES = [J[n] for n in ("left_foot", "right_foot", "head", "left_wrist", "right_wrist")]
 
 
@@ -75,3 +79,18 @@ def raw(
 def stream(positions: np.ndarray, start_ns: int = 10**18, **keywords) -> list[PoseRaw]:
     """One body of (T, J, 3) as messages at 30 Hz."""
     return [raw(start_ns + k * PERIOD_NS, {7: p}, **keywords) for k, p in enumerate(positions)]
+
+
+def clean_body(positions: np.ndarray, **fields: Any) -> CleanBody:
+    """As in ``pose/clean``: joints (22, 3) seen to a centimetre, where ``fields`` say nothing else."""
+    each, seen = np.full(22, 0.01), np.full(22, JointState.SEEN)
+    body = CleanBody(1, positions, UNTURNED, seen, each, 0.0, False, each, each, positions, each)
+    return replace(body, **fields)
+
+
+def world_body(positions: np.ndarray, rotations: np.ndarray = UNTURNED, **fields: Any) -> WorldBody:
+    """As in ``pose/world``: joints (22, 3) seen to a centimetre by a body that stands still, and bears no load."""
+    each, seen = np.full(22, 0.01), np.full(22, JointState.SEEN)
+    root = positions[0], rotations[0], np.zeros(3), np.eye(6)
+    body = WorldBody(1, *root, positions, rotations, seen, each, np.zeros(8), Tracking.OK)
+    return replace(body, **fields)

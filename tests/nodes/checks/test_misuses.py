@@ -15,12 +15,13 @@ from conftest import VirtualClock
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import clean_body
 from tests.helpers.msg_strategies import of
 from tests.helpers.synthetic_poses import walker
 
 from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import CleanBody, Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.checks.stream import Answers, StreamCheck
 from steadypose.nodes.graph.clock import Timeline
@@ -291,10 +292,7 @@ def test_answers_that_are_of_no_use() -> None:
         answers.asked(raw)
         counters["joints_refused"] += 18
     assert [problem.cause for problem in answers.problems()] == ["nearly_all_refused"]
-    flagged = CleanBody(
-        1, np.zeros((22, 3)), np.zeros((22, 4)), np.ones(22), np.zeros(22), 5.0, True, np.zeros(22), np.zeros(22),
-        np.zeros((22, 3)), np.ones(22),
-    )  # fmt: skip
+    flagged = clean_body(np.zeros((22, 3)), anomaly=5.0, anomaly_flag=True)
 
     def flag_all() -> None:
         for raw in good:

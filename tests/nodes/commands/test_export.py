@@ -11,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 from pygltflib import GLTF2
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import world_body
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_WORLD
-from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, Tracking, WorldBody
+from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.sinks.glb import to_glb
 from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, read_motion, to_bvh
@@ -49,19 +50,7 @@ def npz(path: Path, motion: BodyMotion, turn: Rotation) -> Path:
 
 def recording(path: Path, motion: BodyMotion) -> Path:
     def body(id: int, frame: int) -> WorldBody:
-        return WorldBody(
-            id=id,
-            root_position=motion.root[frame],
-            root_orientation=motion.rotations[frame, 0],
-            root_velocity=np.zeros(3),
-            covariance=np.eye(6),
-            positions=motion.positions[frame] + [10.0 * id, 0, 0],
-            rotations=motion.rotations[frame],
-            state=np.ones(22, np.uint8),
-            sigma=np.full(22, 0.01),
-            contacts=np.zeros(8),
-            tracking=Tracking.OK,
-        )
+        return world_body(motion.positions[frame] + [10.0 * id, 0, 0], motion.rotations[frame], id=id)
 
     with RecordingWriter(path) as writer:
         for frame in range(FRAMES):

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import world_body
 
-from steadypose.msgs.types import Tracking, WorldBody
+from steadypose.msgs.types import WorldBody
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, body_name, frames, joint_angles, measures, urdf
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 
@@ -24,10 +25,7 @@ def body(turns: dict[str, Rotation], root: Rotation | None = None) -> WorldBody:
         if parent >= 0:
             positions[child] = positions[parent] + turned[parent] @ REST_OFFSETS[child]
             turned[child] = turned[parent] @ turned[child]
-    return WorldBody(
-        3, positions[0], local[0].as_quat(), np.zeros(3), np.eye(6), positions, local.as_quat(), np.ones(22, np.uint8),
-        np.ones(22), np.zeros(8), Tracking.OK,
-    )  # fmt: skip
+    return world_body(positions, local.as_quat(), id=3)
 
 
 def forward(description: str, angles: dict[str, float], suffix: str) -> dict[str, np.ndarray]:

@@ -9,19 +9,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import clean_body, world_body
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import (
-    CleanBody,
-    JointState,
-    Message,
-    Pose,
-    PoseClean,
-    PoseRaw,
-    PoseWorld,
-    Tracking,
-    WorldBody,
-)
+from steadypose.msgs.types import JointState, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.fit import bodies
@@ -66,11 +57,7 @@ def messages(motion: np.ndarray, raw: np.ndarray | None = None, calibrated: bool
     for t, (clean, seen) in enumerate(zip(in_sensor(motion), in_sensor(raw), strict=True)):
         state = np.full(22, JointState.SEEN)
         state[J["head"]] = JointState.IMPUTED
-        body = CleanBody(
-            id=7, positions=clean, rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)), state=state,
-            sigma=np.full(22, 0.01), anomaly=0.0, anomaly_flag=False, joint_anomaly=np.zeros(22),
-            bone_lengths=np.ones(22), raw_positions=seen, raw_confidence=np.linspace(0.0, 1.0, 22),
-        )  # fmt: skip
+        body = clean_body(clean, id=7, state=state, raw_positions=seen, raw_confidence=np.linspace(0.0, 1.0, 22))
         found.append(
             (POSE_CLEAN, PoseClean(START_NS + round(t * FRAME_NS), "camera", "test", SENSOR, calibrated, 4, [body]))
         )
@@ -243,24 +230,9 @@ def test_each_body_of_a_stream_is_fitted_to_the_points_of_its_own_frames(
 def test_fitted_poses_are_in_the_messages_of_their_body_and_time(load: float) -> None:
     told: list[tuple[str, Message]] = [*messages(still())]
     for t in range(12):
-        body = WorldBody(
-            id=7, root_position=np.zeros(3), root_orientation=np.array([0.0, 0.0, 0.0, 1.0]), root_velocity=np.zeros(3),
-            covariance=np.eye(6), positions=still()[t], rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)),
-            state=np.full(22, JointState.SEEN), sigma=np.full(22, 0.01), contacts=np.full(8, 0.25),
-            tracking=Tracking.OK,
-        )  # fmt: skip
-        told.append(
-            (
-                POSE_WORLD,
-                PoseWorld(
-                    START_NS + round(t * FRAME_NS),
-                    "world",
-                    "test",
-                    np.array([0.0, 0.0, 1.0, 0.0]),
-                    [body, replace(body, id=8)],
-                ),
-            )
-        )
+        body = world_body(still()[t], id=7, root_position=np.zeros(3), contacts=np.full(8, 0.25))
+        bodies, floor = [body, replace(body, id=8)], np.array([0.0, 0.0, 1.0, 0.0])
+        told.append((POSE_WORLD, PoseWorld(START_NS + round(t * FRAME_NS), "world", "test", floor, bodies)))
     (seen,) = bodies_seen(told, 8)
     joints = still() + np.arange(12)[:, None, None] ** 2 * np.array([0.01, 0.0, 0.0])
     fitted = track(joints, load)

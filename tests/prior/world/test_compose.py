@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import clean_body
 
-from steadypose.msgs.types import CleanBody, JointState, Tracking, WorldBody
+from steadypose.msgs.types import JointState, Tracking, WorldBody
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.models.contacts import Contacts
@@ -88,11 +89,7 @@ def test_rotations_that_are_none_are_left_alone():
 def composed(lost_sigma: float = 0.5, speed: float = 2.0, **fields: Any) -> tuple[WorldBody, BodyEstimate]:
     """A body that moves on resting feet as published, heels 5 cm from where they are seen, and no toes."""
     rotations, positions = pose(6)
-    values = {name: np.full(22, 0.01) for name in ("sigma", "joint_anomaly", "bone_lengths", "raw_confidence")}
-    body = CleanBody(
-        id=3, positions=positions, rotations=rotations, state=np.full(22, JointState.SEEN), anomaly=0.0,
-        anomaly_flag=False, raw_positions=positions, **(values | {"bone_lengths": np.zeros(22)}),
-    )  # fmt: skip
+    body = clean_body(positions, id=3, rotations=rotations, bone_lengths=np.zeros(22))
     observed = BodyObservation(
         body, 0, 1 / 30, positions.copy(), np.array([0.0, 0.0, 0.6, 0.8]), np.ones(22, dtype=bool), np.full(22, 0.01),
         **({"root_sigma": 0.02, "pelvis_observed": True} | fields),

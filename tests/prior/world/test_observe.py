@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.helpers.bodies import clean_body
 
 from steadypose.msgs.types import CleanBody, JointState
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, yaw_matrix
@@ -25,12 +26,7 @@ HIPS = [J["left_hip"], J["right_hip"]]
 
 
 def body(**fields: Any) -> CleanBody:
-    joints = {name: np.full(22, 0.01) for name in ("sigma", "joint_anomaly", "bone_lengths", "raw_confidence")}
-    some = CleanBody(
-        id=1, positions=STANDING, rotations=np.tile(UNIT, (22, 1)), state=np.full(22, JointState.SEEN),
-        anomaly=0.0, anomaly_flag=False, raw_positions=STANDING, **joints,
-    )  # fmt: skip
-    return replace(some, **fields)
+    return replace(clean_body(STANDING), **fields)
 
 
 def seen(last: BodyObservation | None = None, after_s: float = 0.0, **fields: Any) -> BodyObservation:
