@@ -59,7 +59,10 @@ class Scene(NamedTuple):
 
 
 def gestures(rng: np.random.Generator) -> Scene:
-    """Stand before the camera and raise hands, wave and point, one after the other, with either arm."""
+    """Stand before the camera and raise hands, wave and point, one after the other, with either arm.
+
+    A wave begins where the hand first turns, as in `event_mocap`: until then, it is a raised hand that moves aside.
+    """
     acts = rng.permutation([(act, side) for act in ("raise", "wave", "point") for side in ("left", "right")])
     ground = plan((rng.uniform(2.2, 3.0), rng.uniform(-0.3, 0.3)), np.pi + rng.uniform(-0.4, 0.4), [Stand(28.0)])
     intent, labels = Intent(ground), []
@@ -73,8 +76,10 @@ def gestures(rng: np.random.Generator) -> Scene:
             began = at + blend
             ample = 0.22 * minimum_jerk((t - began) / 0.3)
             beat = 2.0 * np.pi * rng.uniform(1.2, 1.9) * (t - began)
-            goal += np.stack([0.0 * t, sign * ample * np.sin(beat), -0.25 * ample * np.sin(beat) ** 2], axis=-1)
-            labels.append(Label(0, EventKind.WAVES, hand, began, at + lasts - blend))
+            aside = ample * np.sin(beat)
+            goal += np.stack([0.0 * t, sign * aside, -0.25 * aside * np.sin(beat)], axis=-1)
+            turned = float(t[:-1][(t[:-1] > began) & (np.diff(aside) < 0.0)][0])
+            labels.append(Label(0, EventKind.WAVES, hand, turned, at + lasts - blend))
         if act == "point":
             labels.append(Label(0, EventKind.POINTS, hand, at + blend, at + lasts - blend))
         pole = np.array([-0.35, 0.75 * sign, -0.9])

@@ -65,7 +65,7 @@ class EventSettings:
     raised_margin: float = 0.08
     """Reduction of that height at which the hand is no longer raised, metres."""
     wave_swing: float = 0.45
-    """Least angle of the forearm's swing from side to side in a wave, radians."""
+    """Least angle of the forearm's swing from side to side in a wave, radians; of the first, less than half."""
     wave_within: float = 0.8
     """Longest time until the next swing, after which the wave is over, seconds."""
     point_elbow: float = 2.4
@@ -225,7 +225,8 @@ class _Body:
         speeds = self._wrist_speeds(now, seen.arms)
         for hand, arm, speed in zip((Hand.LEFT, Hand.RIGHT), seen.arms, speeds, strict=True):
             take(EventKind.HAND_RAISED, hand, *arm.raised, possible=upright and not lies)
-            waving = self._waves[hand].update(now, arm.swing, arm.upright and not lies, arm.up and not lies)
+            upright_arm, up = arm.upright and not lies, arm.up and not lies
+            waving = self._waves[hand].update(now, arm.swing, arm.raised.value, upright_arm, up)
             take(EventKind.WAVES, hand, float(waving), CERTAIN)
             still = speed < s.point_speed and arm.lift > s.point_lift
             take(EventKind.POINTS, hand, *arm.elbow, possible=still and not lies)

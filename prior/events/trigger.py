@@ -1,13 +1,15 @@
 """Conditions that begin and end, and the detection of waves.
 
 A condition has two thresholds (hysteresis), a time that it must hold, and takes account of its value's uncertainty. A
-raised hand waves if its forearm swings to one side and back, and again.
+raised hand waves if its forearm swings to one side and back.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from statistics import NormalDist
+from typing import NamedTuple
 
 NEVER = -1
 
@@ -69,18 +71,33 @@ class Trigger:
 
 
 SWINGS = 2
-"""Number of swings of a wave: out and back. If the swing is not about upright, one more is needed, because an arm that
-is raised to the side and lowered also starts like this."""
-CENTRED = 0.4
-"""Largest angle from upright of the middle of a swing, or of its last part, for a swing about upright, radians."""
+"""Number of swings of a wave: out and back. If they are not about upright, one more is needed, because an arm that is
+raised to the side and lowered also starts like this."""
+OUT = 0.45
+"""Least size of a wave's first swing, as a fraction of the others': it begins in the middle, and smoothing takes the
+most from it."""
+CENTRED = 0.45
+"""Largest mean angle from upright of two swings about upright, radians."""
+SPEED, SPEED_NS = 1.0, 140_000_000
+"""Least speed of the forearm when a swing counts, radians per second, and the time over which it is measured,
+nanoseconds. A raised hand that drifts is slower, as is a joint that jumped while it was hidden and came to rest."""
+LEVEL = 0.12
+"""Largest change of the hand's height in a swing about upright, metres: that of an arm raised aside or lowered is
+larger."""
+
+
+class _Moment(NamedTuple):
+    angle: float
+    height: float
+    stamp_ns: int
 
 
 class Wave:
-    """Detects waves from the turning points of a forearm. One counts when the forearm has returned from it by a swing.
+    """Detects waves from the swings of a forearm between its turns.
 
     Args:
-        swing: angle of the return, radians.
-        within_s: longest time until the next turning point, seconds.
+        swing: angle from the last turn at which a swing counts, radians.
+        within_s: longest duration of a swing, and longest time between two that count, seconds.
     """
 
     def __init__(self, swing: float, within_s: float) -> None:
@@ -88,42 +105,61 @@ class Wave:
         self._reset()
 
     def _reset(self) -> None:
-        self._low, self._high = math.inf, -math.inf
-        self._about_upright = False
-        self._extreme = math.nan
-        self._side = self._turns = self._turned_ns = 0
+        self._recent: deque[_Moment] = deque()
+        self._turns: list[_Moment] = []
+        self._side = self._swings = self._swung_ns = 0
+        self._counted = self._waves = False
 
-    def update(self, stamp_ns: int, angle: float, upright: bool, up: bool) -> bool:
+    def update(self, stamp_ns: int, angle: float, height: float, upright: bool, up: bool) -> bool:
         """Process the forearm's next angle to one side of upright, radians; returns whether it waves.
 
         A wave begins while the forearm is ``upright``, and continues while the hand is ``up``, because in a wave with
         the whole arm, the forearm is almost horizontal at each end. An angle of NaN (an unobserved arm) is no swing.
+        ``height`` is that of the hand, metres.
         """
-        if not (up if self._turns else upright):
+        if not (up if self._swings else upright):
             self._reset()
             return False
-        if self._turns and stamp_ns - self._turned_ns > self._within_ns:
-            self._reset()
-        if math.isnan(angle):
-            return self._waves()
-        self._low, self._high = min(self._low, angle), max(self._high, angle)
-        if self._side <= 0 and angle - self._low > self._swing:
-            self._turn(1, stamp_ns, angle, self._low, self._high)
-        elif self._side >= 0 and self._high - angle > self._swing:
-            self._turn(-1, stamp_ns, angle, self._high, self._low)
-        return self._waves()
+        if stamp_ns - self._swung_ns > self._within_ns:
+            self._swings, self._waves = 0, False
+        if not math.isnan(angle):
+            self._follow(angle, height, stamp_ns)
+        return self._waves
 
-    def _waves(self) -> bool:
-        return self._turns > SWINGS or (self._turns == SWINGS and self._about_upright)
+    def _follow(self, angle: float, height: float, stamp_ns: int) -> None:
+        """Find the forearm's turns, and count its swings."""
+        if self._recent:  # an angle that passes half a turn continues there
+            angle = self._recent[-1].angle + math.remainder(angle - self._recent[-1].angle, math.tau)
+        now = _Moment(angle, height, stamp_ns)
+        if not self._recent:
+            self._low = self._high = now
+        self._recent.append(now)
+        while stamp_ns - self._recent[0].stamp_ns > SPEED_NS:
+            self._recent.popleft()
+        self._low = now if angle <= self._low.angle else self._low
+        self._high = now if angle >= self._high.angle else self._high
+        if self._side <= 0 and angle - self._low.angle > OUT * self._swing:
+            self._side, self._counted, self._turns, self._high = 1, False, [*self._turns[-1:], self._low], now
+        elif self._side >= 0 and self._high.angle - angle > OUT * self._swing:
+            self._side, self._counted, self._turns, self._low = -1, False, [*self._turns[-1:], self._high], now
+        if self._turns and not self._counted and abs(angle - self._turns[-1].angle) > self._swing:
+            self._counted = True
+            self._count(now)
 
-    def _turn(self, side: int, stamp_ns: int, angle: float, extreme: float, before: float) -> None:
-        whole = extreme + (self._extreme if self._turns else before)
-        self._about_upright = min(abs(whole), abs(extreme + angle)) < 2.0 * CENTRED
-        self._extreme = extreme
-        self._side = side
-        self._low = self._high = angle
-        self._turns += 1
-        self._turned_ns = stamp_ns
+    def _count(self, now: _Moment) -> None:
+        """Count the swing from the last turn, and the first one before it, which may be smaller."""
+        before, turn, then = self._turns[0], self._turns[-1], self._recent[0]
+        slow = abs(now.angle - then.angle) <= SPEED * (now.stamp_ns - then.stamp_ns) * 1e-9
+        if now.stamp_ns - turn.stamp_ns > self._within_ns or (slow and not self._waves):
+            self._swings = 0
+            return
+        if not self._swings and 0 < turn.stamp_ns - before.stamp_ns < self._within_ns:
+            self._swings = 1
+        self._swings += 1
+        self._swung_ns = now.stamp_ns
+        centred = abs(turn.angle + 0.5 * (before.angle + now.angle)) < 2.0 * CENTRED
+        about_upright = centred and abs(now.height - turn.height) < LEVEL
+        self._waves |= self._swings > SWINGS or (self._swings == SWINGS and about_upright)
 
 
 class RandomWalk:
