@@ -40,7 +40,7 @@ class EventSettings:
     """Largest angle between the trunk's heading and the direction of the sensor for a body that faces it, radians."""
     faces_margin: float = 0.2
     """Additional angle at which a body no longer faces the sensor, radians."""
-    faces_turn: float = 0.3
+    faces_turn: float = 0.2
     """RMS change in one second of the line from right to left hips and shoulders, metres."""
     stands: float = 0.85
     """Least height of the hips above the lower ankle of a standing body, leg lengths."""

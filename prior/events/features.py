@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JointState, WorldBody
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import REST_POSITIONS, J
 
 Point = list[float]
 HAND = 0.18
 """Distance from wrist to fingertips of an adult, metres (Drillis and Contini 1966: 0.108 of the stature)."""
+
+ACROSS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder")]
+HIPS, SHOULDERS = (
+    float(REST_POSITIONS[J[f"left_{part}"], 1] - REST_POSITIONS[J[f"right_{part}"], 1]) for part in ("hip", "shoulder")
+)
+"""Distances between the hip and shoulder joints of an adult, metres."""
 
 NARROW = 0.05
 """Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
@@ -70,7 +76,8 @@ class Features(NamedTuple):
     to_sensor: tuple[float, float]
     """(2,) horizontal vector from the pelvis to the sensor, metres."""
     across: tuple[float, float]
-    """(2,) horizontal vector from right to left, hips and shoulders together, metres, normal to the heading."""
+    """(2,) horizontal vector from right to left, hips and shoulders together, metres, normal to the heading; from the
+    rotations of pelvis and chest, because bone lengths and the whole body correct their joints."""
     across_sigma: float
     """Standard deviation of each component of `across`, metres."""
     extension: Quantity
@@ -113,16 +120,13 @@ def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.n
         extent = Quantity(high - low, math.hypot(s[lowest], s[highest]))
     else:
         extent = Quantity(math.nan, math.nan)
-    left = [
-        p[J["left_hip"]][k] - p[J["right_hip"]][k] + p[J["left_shoulder"]][k] - p[J["right_shoulder"]][k]
-        for k in (0, 1)
-    ]
+    left = _left(body) if all(known[ACROSS]) else (math.nan, math.nan)
     to_sensor = (float(sensor[0] - body.root_position[0]), float(sensor[1] - body.root_position[1]))
     return Features(
         _away(body, to_sensor),
         to_sensor,
-        (left[0], left[1]),
-        math.sqrt(sum(s[J[f"{side}_{part}"]] ** 2 for side in ("left", "right") for part in ("hip", "shoulder"))),
+        left,
+        math.sqrt(sum(s[joint] ** 2 for joint in ACROSS)),
         extension,
         thigh,
         extent,
@@ -167,7 +171,22 @@ def _from_height(p: list[Point], height: float, leg: float, sigma: float) -> tup
     return Quantity(height / leg, spread / leg), Quantity(angle, spread / max(thigh, 0.1))
 
 
-def _arm(p: list[Point], s: list[float], observed: list[bool], left: list[float], side: str) -> Arm:
+def _left(body: WorldBody) -> tuple[float, float]:
+    rotations, root = body.rotations.tolist(), body.root_orientation.tolist()
+    chest = [0.0, SHOULDERS, 0.0]
+    for joint in (J["spine3"], J["spine2"], J["spine1"]):
+        chest = _rotated(rotations[joint], chest)
+    chest, hips = _rotated(root, chest), _rotated(root, [0.0, HIPS, 0.0])
+    return chest[0] + hips[0], chest[1] + hips[1]
+
+
+def _rotated(quaternion: list[float], v: Point) -> Point:
+    x, y, z, w = quaternion
+    a, b, c = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
+    return [v[0] + w * a + y * c - z * b, v[1] + w * b + z * a - x * c, v[2] + w * c + x * b - y * a]
+
+
+def _arm(p: list[Point], s: list[float], observed: list[bool], left: tuple[float, float], side: str) -> Arm:
     shoulder, elbow, wrist = (J[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist"))
     neck, head = J["neck"], J["head"]
     upper, lower = _distance(p[shoulder], p[elbow]), _distance(p[elbow], p[wrist])

@@ -235,6 +235,16 @@ def test_the_sensor_that_is_faced_is_where_it_is_said_to_be() -> None:
     assert not faces([5.0, 0.0, 1.0])
 
 
+def test_where_a_body_faces_comes_from_its_rotations_not_from_a_shoulder_that_is_off() -> None:
+    body = message(0, standing()).bodies[0]
+    body.positions[J["left_shoulder"], 0] += 0.4
+    assert features(body, np.zeros(3)).across == pytest.approx((0.0, -0.536))
+    body.rotations[J["spine2"]] = [0.0, 0.0, 0.5, np.sqrt(0.75)]  # the chest turns left by 60 degrees
+    assert features(body, np.zeros(3)).across == pytest.approx((0.36 * np.sqrt(0.75), -0.176 - 0.18))
+    body.state[J["left_shoulder"]] = JointState.UNKNOWN
+    assert np.isnan(features(body, np.zeros(3)).across).all()
+
+
 def test_what_holds_is_told_with_every_message_and_since_when() -> None:
     detector = EventDetector()
     events = [detector.update(message(i, standing())) for i in range(30)]
