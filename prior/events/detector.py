@@ -64,7 +64,7 @@ class EventSettings:
     """Least height of the fingertips above the neck of a raised hand, metres."""
     raised_margin: float = 0.08
     """Reduction of that height at which the hand is no longer raised, metres."""
-    wave_swing: float = 0.45
+    wave_swing: float = 0.35
     """Least angle of the forearm's swing from side to side in a wave, radians; of the first, less than half."""
     wave_within: float = 0.8
     """Longest time until the next swing, after which the wave is over, seconds."""

@@ -81,7 +81,7 @@ CENTRED = 0.45
 SPEED, SPEED_NS = 1.0, 140_000_000
 """Least speed of the forearm when a swing counts, radians per second, and the time over which it is measured,
 nanoseconds. A raised hand that drifts is slower, as is a joint that jumped while it was hidden and came to rest."""
-LEVEL = 0.12
+LEVEL = 0.08
 """Largest change of the hand's height in a swing about upright, metres: that of an arm raised aside or lowered is
 larger."""
 

@@ -305,10 +305,10 @@ BACK = np.linspace(-0.1, -0.7, 12).tolist()
 
 
 def test_a_wave_begins_when_the_forearm_is_back_from_its_first_swing_which_may_be_small() -> None:
-    assert wave_begins([*RAISED, *OUT, *BACK[:9]])
-    assert not wave_begins([*RAISED, *OUT, *BACK[:7]])
-    assert not wave_begins([*RAISED, *BACK])
-    assert not wave_begins([*RAISED, *[0.7 * (angle + 0.3) - 0.3 for angle in OUT], *BACK]), "that was no swing"
+    assert wave_begins([*RAISED, *OUT, *BACK[:7]])
+    assert not wave_begins([*RAISED, *OUT, *BACK[:6]])
+    assert not wave_begins([*RAISED, *BACK[4:]])
+    assert not wave_begins([*RAISED, *[0.5 * (angle + 0.3) - 0.3 for angle in OUT], *BACK[2:]]), "that was no swing"
 
 
 def test_a_hand_that_comes_down_does_not_wave() -> None:
