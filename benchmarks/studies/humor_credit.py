@@ -80,10 +80,11 @@ def run(bench: Bench) -> Result:
     """Make all tables."""
     clips = bench.clips(FRAMES, 2 if bench.quick else CLIPS)
     model, count = shipped(), len(clips.offsets)
+    phases = [(1, poses) for _, poses in PHASES] if bench.quick else PHASES
     records = {
         "credit": credit(bench, model, clips),
         "terms": terms(bench, model, clips, range(0, count, KEY_POINTS)),
-        "rolled": rolled(model, clips, range(0, count, ROLLED), [(1, one) for _, one in PHASES] if bench.quick else PHASES),
+        "rolled": rolled(model, clips, range(0, count, ROLLED), phases),
     }
     tables = [credit_table(records["credit"], count), terms_table(records["terms"]), rolled_table(records["rolled"])]
     return Result(tables, {"data": clips.source, "records": records})
@@ -112,7 +113,8 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
             name: errors(model, clips, starts, seen, settings, stages, range(len(clips.offsets)))
             for name, (settings, stages) in bench.progress.track(fits.items(), description=f"credit, {condition}")
         }
-        found[CLEANED] = np.array([_error(starts[:, c], clips.positions[:, c], seen[:, c]) for c in range(seen.shape[1])])
+        each = (starts.swapaxes(0, 1), clips.positions.swapaxes(0, 1), seen.swapaxes(0, 1))
+        found[CLEANED] = np.array([_error(*one) for one in zip(*each, strict=True)])
         for name, each in found.items():
             records.append({
                 "condition": condition, "method": name,
