@@ -190,7 +190,7 @@ def rolled(
         {
             "method": name,
             **_paired(each[name], each[FULL], clips.person[which]),
-            **scores(answers, truth, np.isnan(seen[:, which, :, 0]), load),
+            **scores(answers, truth, np.isnan(seen[..., 0])[:, which], load),
         }
         for name, answers in found.items()
     ]

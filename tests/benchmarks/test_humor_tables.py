@@ -84,6 +84,7 @@ def test_what_a_fit_owes_to_the_model_is_paired_by_clip(tmp_path: Path, monkeypa
     monkeypatch.setattr(humor_credit, "SMOOTH", (4.0,))
     monkeypatch.setattr(humor_credit, "camera_settings", lambda: brief(fits.camera_settings()))
     some = (humor_credit.FULL, "no E_init", "no E_env")
+    monkeypatch.setattr(humor_credit, "ROLLED", 1)
     monkeypatch.setattr(humor_credit, "TERMS", {name: humor_credit.TERMS[name] for name in some})
     with Progress(disable=True) as progress:
         result = humor_credit.run(Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress))
