@@ -64,7 +64,7 @@ def followed(robot: Robot, stream: list[PoseWorld]) -> tuple[list[RobotPose], ND
     "name", ["walk_turn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sit_rise", "wave_hidden_arm"))]
 )
 def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: Robot, name: str) -> None:
-    poses, away = followed(robot, worlds(name))
+    poses, away = followed(robot, worlds(name)[:240])
     joints = np.array([pose.joints for pose in poses])
     assert (joints >= robot.lower).all()
     assert (joints <= robot.upper).all()
@@ -106,8 +106,8 @@ def test_it_begins_and_stops_smoothly(robot: Robot) -> None:
 
 
 def test_the_next_person_is_followed_when_the_first_has_gone_without_a_jump_of_the_joints(robot: Robot) -> None:
-    stream = worlds("crossing")[:200]
-    follower, poses, leaves_ns = Follower(Retargeter(robot)), [], stream[100].stamp_ns
+    stream = worlds("crossing")[:160]
+    follower, poses, leaves_ns = Follower(Retargeter(robot)), [], stream[60].stamp_ns
     for world in stream:
         gone = leaves_ns <= world.stamp_ns < leaves_ns + GONE_NS
         there = [body for body in world.bodies if not gone and (body.id == 1) == (world.stamp_ns < leaves_ns)]
