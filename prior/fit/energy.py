@@ -116,13 +116,14 @@ class Smooth(Quadratic):
     """E_smooth, of the joints' accelerations: a motion prior without knowledge of bodies.
 
     Attributes:
-        sigma: m/s² along an axis.
+        sigma: m/s² along an axis; one for all, or one for each joint of each frame but the first and last, (T - 2, 22).
     """
 
-    sigma: float = 4.0
+    sigma: float | Tensor = 4.0
 
     def residual(self, motion: Motion) -> Tensor:
-        return motion.joints.diff(n=2, dim=0) * FPS**2 / self.sigma
+        sigma = self.sigma.unsqueeze(-1) if isinstance(self.sigma, Tensor) else self.sigma
+        return motion.joints.diff(n=2, dim=0) * FPS**2 / sigma
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,9 @@
-"""The three stages of test-time optimisation (HuMoR, section 4.3), by L-BFGS."""
+"""The three stages of test-time optimisation (HuMoR, section 4.3), by L-BFGS, of which the last must earn its place.
+
+HuMoR's stage 3 is accurate where people move as in its training data and too stiff where they do not: of dancers, its
+error is above that of the input. This shows in the observations, so stage 3 is kept only if it explains them nearly as
+well as stage 2 (the discrepancy principle, Morozov 1966).
+"""
 
 from __future__ import annotations
 
@@ -9,11 +14,14 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.energy import Anchored, Bones, FirstState, Ground, Smooth, Standing, Term, Transitions, energy
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
+from steadypose.prior.fit.tensors import forward_kinematics
+from steadypose.prior.timing.rate import FPS
 
 POSES = ("root", "orientation", "turns")
 
@@ -26,6 +34,13 @@ STIFFNESS = 30.0
 TOLERANCE = 1e-4
 """Relative decrease of the energy below which a round is the last."""
 
+WINDOW = 7
+"""Number of frames of which a joint's initial acceleration is the median."""
+
+UNLIKELY, NEGLIGIBLE = 1.08, 0.1
+"""Stage 3 is kept if the energy of the observations is at most this many times that of stage 2, or at most this share
+of the energy expected of their noise. Chosen on validation people (benchmarks/NOTEBOOK.md)."""
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -33,32 +48,37 @@ class FitSettings:
 
     Attributes:
         root_steps, pose_steps, motion_steps: numbers of L-BFGS steps, with up to five evaluations each.
-        smooth_sigma: m/s², of `Smooth` in stage 2.
+        smooth_sigma: m/s², of `Smooth` in stages 1 and 2.
+        agility: ratio of the standard deviation of a joint's accelerations to its initial ones nearby, added to
+            ``smooth_sigma`` in squares; 0 if the initial poses shake.
         pose_sigma: of `FirstState` as a prior of all states in stage 2.
         transitions: the transition term of stage 3.
         first_sigma: of `FirstState` as a prior of all states in stage 3.
         motion_smooth_sigma: m/s², of `Smooth` in stage 3, against jitter that the motion model allows.
         standing: the contact term of stage 3.
+        unlikely: as `UNLIKELY`; infinite to keep stage 3 always.
         bones_sigma: metres, of `Bones`.
         ground_height_sigma: metres, of `Ground` if the ground is unknown.
         ground_tilt_sigma: radians, of `Ground` if the ground is unknown.
     """
 
     root_steps: int = 30
-    pose_steps: int = 60
+    pose_steps: int = 100
     motion_steps: int = 100
     smooth_sigma: float = 4.0
-    pose_sigma: float = 4.0
+    agility: float = 2.0
+    pose_sigma: float = 12.0
     transitions: Transitions = field(default_factory=Transitions)
     first_sigma: float = 6.0
     motion_smooth_sigma: float = 8.0
     standing: Standing = field(default_factory=Standing)
+    unlikely: float = UNLIKELY
     bones_sigma: float = 0.01
     ground_height_sigma: float = 0.05
     ground_tilt_sigma: float = 0.03
 
 
-PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200)
+PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, agility=0.0, pose_sigma=4.0)
 """Settings for key points of an image, which determine size less well and start farther from the solution."""
 
 
@@ -93,12 +113,14 @@ class Fitted:
     """The fit of a window.
 
     Attributes:
-        motion: motion of least energy, without gradients.
+        motion: motion of least energy, without gradients, of the last stage or the one before.
         energies: (stages,) nats, energy of a stage's terms at its end.
+        kept: whether the last stage was kept.
     """
 
     motion: Motion
     energies: tuple[float, ...]
+    kept: bool = True
 
 
 def fit_window(
@@ -126,14 +148,24 @@ def fit_window(
     variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
     given = [*observed, *([anchor] if anchor else [])]
     found: list[float] = []
-    for stage in _stages(start, given, settings)[:stages]:
+    before, chosen = variables, _stages(start, given, settings)[:stages]
+    for stage in chosen:
         if "latents" in stage.free:
             variables = replace(variables, latents=Motion(model, variables).encoded_latents())
+        before = variables
         variables, value = minimise(model, variables, stage.free, stage.terms, stage.steps)
         found.append(value)
         advanced()
     with torch.no_grad():
-        return Fitted(Motion(model, variables), tuple(found))
+        motion, earlier = Motion(model, variables), Motion(model, before)
+        kept = "latents" not in chosen[-1].free or _explains(motion, earlier, observed, settings.unlikely)
+        return Fitted(motion if kept else earlier, tuple(found), kept)
+
+
+def _explains(motion: Motion, before: Motion, observed: Sequence[Term], unlikely: float) -> bool:
+    """Whether ``motion`` explains the observations nearly as well as ``before`` it."""
+    noise = sum(0.5 * term.residual(motion).numel() for term in observed)
+    return float(energy(motion, observed)) <= max(unlikely * float(energy(before, observed)), NEGLIGIBLE * noise)
 
 
 class _Stage(NamedTuple):
@@ -151,7 +183,7 @@ def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[
     if not start.ground_known:
         shape.append(Ground(start.ground, settings.ground_height_sigma, settings.ground_tilt_sigma))
         body = (*body, "ground")
-    smooth = Smooth(settings.smooth_sigma)
+    smooth = Smooth(torch.hypot(torch.tensor(settings.smooth_sigma), settings.agility * _accelerations(start)))
     poses = [*given, *shape, smooth, FirstState(settings.pose_sigma, all_states=True)]
     motion = [
         *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,
@@ -162,6 +194,17 @@ def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[
         _Stage(body, poses, settings.pose_steps),
         _Stage((*body, "latents"), motion, settings.motion_steps),
     ]
+
+
+def _accelerations(start: Start) -> Tensor:
+    """(T - 2, 22) m/s² along an axis, median over `WINDOW` frames of the initial poses' accelerations.
+
+    A jump, where a joint is lost or found, is no motion; the median leaves it out.
+    """
+    joints = forward_kinematics(start.rotations, start.offsets, start.root)[0]
+    size = (joints.diff(n=2, dim=0) * FPS**2).square().mean(dim=-1).sqrt()
+    around = pad(size.mT.unsqueeze(0), (WINDOW // 2, WINDOW // 2), mode="replicate")[0]
+    return around.unfold(-1, WINDOW, 1).median(dim=-1).values.mT
 
 
 def minimise(

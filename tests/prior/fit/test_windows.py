@@ -15,11 +15,11 @@ from tests.helpers.bodies import waving
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.fit import windows
-from steadypose.prior.fit.energy import energy
+from steadypose.prior.fit.energy import Smooth, energy
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.motion import Motion, Variables
 from steadypose.prior.fit.observations import SeenJoints
-from steadypose.prior.fit.solve import FitSettings, Start, _stages, fit_window
+from steadypose.prior.fit.solve import UNLIKELY, FitSettings, Start, _explains, _stages, fit_window
 from steadypose.prior.fit.windows import _fingerprint, _grounded, _joined, load_of, window_bounds
 
 
@@ -107,9 +107,11 @@ def test_each_stage_lowers_the_energy_of_its_terms_and_says_so() -> None:
     positions = waving(6) + 0.01 * np.random.default_rng(0).standard_normal((6, 22, 3))
     start = Start.of(positions[:, 0] + 0.05, np.tile(np.eye(3), (6, 22, 1, 1)), REST_OFFSETS)
     seen = SeenJoints(torch.from_numpy(positions).float(), torch.full((6, 22), 0.02))
-    brief, told = FitSettings(root_steps=20, pose_steps=20, motion_steps=20), []
+    brief = FitSettings(root_steps=20, pose_steps=20, motion_steps=20, agility=0.0, unlikely=torch.inf)
+    told: list[int] = []
     found = fit_window(model, start, [seen], brief, advanced=lambda: told.append(1))
     assert len(found.energies) == len(told) == 3
+    assert found.kept
     assert not any(p.requires_grad for p in model.parameters())
     assert not found.motion.variables.root.requires_grad
     before = Variables.initial(start.root, start.rotations, start.offsets, 0.0, 4)
@@ -123,6 +125,45 @@ def test_each_stage_lowers_the_energy_of_its_terms_and_says_so() -> None:
         assert value < 0.6 * float(energy(Motion(model, before), stages[number - 1].terms))
         changed = {name for name in stages[2].free if getattr(upto.motion.variables, name).any()}
         assert changed == set(stages[number - 1].free)
+
+
+def test_a_motion_model_that_contradicts_the_observations_is_left_out() -> None:
+    torch.manual_seed(0)
+    model = HumorNet(HumorConfig(hidden=64, latent=4, components=2)).eval()  # not trained
+    positions = waving(6)
+    start = Start.of(positions[:, 0], np.tile(np.eye(3), (6, 22, 1, 1)), REST_OFFSETS)
+    seen = SeenJoints(torch.from_numpy(positions).float(), torch.full((6, 22), 0.01))
+    settings = FitSettings(root_steps=20, pose_steps=20, motion_steps=20)
+    found, before = fit_window(model, start, [seen], settings), fit_window(model, start, [seen], settings, stages=2)
+    assert not found.kept
+    assert len(found.energies) == 3
+    torch.testing.assert_close(found.motion.joints, before.motion.joints)
+    assert before.kept
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "kept"), [(50.0, 53.9, True), (50.0, 54.1, False), (1.0, 9.9, True), (1.0, 10.1, False)]
+)
+def test_the_last_stage_may_explain_a_little_less_or_anything_far_below_the_noise(
+    before: float, after: float, kept: bool
+) -> None:
+    def of(nats: float) -> Motion:
+        return cast(Motion, torch.full((200,), (nats / 100.0) ** 0.5))  # 200 residuals; 100 nats are their noise's
+
+    term = cast(Any, SimpleNamespace(residual=lambda values: values, kernel=lambda square: square))
+    assert _explains(of(after), of(before), [term], UNLIKELY) == kept
+
+
+def test_smoothness_yields_to_what_a_joint_does_and_not_to_a_jump() -> None:
+    root = torch.zeros(30, 3)
+    root[:, 0] = 0.5 * 6.0 * (torch.arange(30) / 30.0) ** 2
+    root[20:, 1] += 0.3
+    start = Start(root, torch.eye(3).repeat(30, 22, 1, 1), torch.zeros(22, 3))
+    (smooth,) = _stages(start, [], FitSettings(smooth_sigma=4.0, agility=2.0))[0].terms
+    assert isinstance(smooth, Smooth)
+    assert isinstance(smooth.sigma, torch.Tensor)
+    expected = torch.full((28, 22), (4.0**2 + 2.0**2 * 6.0**2 / 3.0) ** 0.5)
+    torch.testing.assert_close(smooth.sigma, expected, rtol=1e-3, atol=0.0)
 
 
 def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
