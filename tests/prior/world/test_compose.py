@@ -134,10 +134,11 @@ def test_of_a_guessed_leg_no_contact_is_published_and_its_foot_is_as_uncertain_a
     said = np.full(22, 0.01)
     said[[J["left_ankle"], J["right_ankle"]]] = 0.14
     guessed = (False, False, True, False, True, False)
-    body, _ = composed(guessed=guessed, sigma=said)
+    body, estimate = composed(guessed=guessed, sigma=said)
     np.testing.assert_array_equal(np.isnan(body.contacts), [*guessed, False, False])
     np.testing.assert_allclose(body.contacts[[0, 1, 3, 5, 6, 7]], np.linspace(0, 1, 8)[[0, 1, 3, 5, 6, 7]], atol=1e-6)
     assert body.sigma[[J["left_ankle"], J["right_ankle"]]].tolist() == pytest.approx([0.14, 0.03])
+    assert np.isfinite(estimate.contacts.load).all(), "the estimate itself is left alone"
     surer, _ = composed(guessed=guessed)
     assert surer.sigma[J["left_ankle"]] == pytest.approx(0.03)
 
