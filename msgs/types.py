@@ -296,7 +296,8 @@ class WorldBody(_Record):
     sigma: PerJoint
     """(22,) metres, standard deviation of a position along an axis"""
     contacts: Annotated[_Array, Array(np.float32, (_C,))]
-    """(8,) probability that each joint of `CONTACTS` bears load on a surface, at rest or rolling over it"""
+    """(8,) probability that each joint of `CONTACTS` bears load on a surface, at rest or rolling over it; NaN, unknown,
+    for a foot (ankle and toes) that was not observed for the last 2 s or never, and for its knee if that was not"""
     tracking: Annotated[Tracking, Integer(0, len(Tracking), Tracking)]
 
 

@@ -29,6 +29,7 @@ from steadypose.benchmarks.intervals import Interval, ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import ROOT, VARIANTS
 from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped
 from steadypose.benchmarks.studies.kinect_clips import side_by_side
 from steadypose.benchmarks.studies.rotations_truth import (
     SCORED,
@@ -44,6 +45,8 @@ from steadypose.benchmarks.studies.rotations_truth import (
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import (
     global_rotations,
     heading,
@@ -54,6 +57,9 @@ from steadypose.prior.body.kinematics import (
 from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import OrientSettings, PriorSettings
+from steadypose.prior.fit.bodies import lowest_floor
+from steadypose.prior.fit.solve import FitSettings, Start
+from steadypose.prior.fit.windows import Track, fit_track
 from steadypose.prior.models.posture import RootCovariance, trunk_frame
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
@@ -145,12 +151,13 @@ def _errors(path: Path, settings: PriorSettings) -> dict[str, list[float]]:
     }
 
 
-DEPENDS_ON = VARIANTS
+DEPENDS_ON = (*VARIANTS, "humor weights", "prior.fit")
 
-DELAY = PriorSettings().delay
+DELAY, FIT_DELAY = PriorSettings().delay, 8
+"""Delays of the live output that is scored, and of that from which fits start, frames."""
 LASTING_S = 0.5
 """Correlation time of time-correlated noise (to 1 / e), seconds."""
-PERFECT, AIMED, STEADYPOSE = "none", "aimed bones", "steadypose"
+PERFECT, AIMED, STEADYPOSE, FIT = "none", "aimed bones", "steadypose", "`steadypose fit`, offline"
 METHODS: Mapping[str, PriorSettings] = {
     AIMED: PriorSettings(orient=OrientSettings(enabled=False)),
     "HM-VAE, one pass": product.PRODUCT["HM-VAE"],
@@ -224,11 +231,24 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
             turned, _covariance(cleaned, turned) if name == STEADYPOSE else np.full((*turned.shape[:2], 3, 3), np.nan)
         )
         joints = cleaned.positions if name == STEADYPOSE else joints
+    found[FIT] = _Turned(_fitted(seen), np.full((*seen.shape[:2], 3, 3), np.nan))
     for name, root in roots.items():  # of the root only, from the joints that steadypose publishes
         turned = found[AIMED].orientations.copy()
         turned[:, :, 0] = root(joints.reshape(-1, 22, 3)).reshape(turned[:, :, 0].shape)
         found[name] = _Turned(turned, np.full((*turned.shape[:2], 3, 3), np.nan))
     return found
+
+
+def _fitted(seen: Floats) -> Floats:
+    """Return the orientations (T, C, 17, 3, 3) of fits of joints (T, C, 22, 3)."""
+    cleaned = product.run(PriorSettings(), seen, np.arange(len(seen)) / FPS, FIT_DELAY).positions[-len(seen) :]
+    model, found = shipped(), []
+    for joints, start in zip(seen.swapaxes(0, 1), cleaned.swapaxes(0, 1), strict=True):
+        offsets = estimate_offsets(start)
+        begin = Start.of(start[:, 0], solve_rotations(start, offsets), offsets, lowest_floor(start))
+        fitted = fit_track(model, Track([begin], seen_joints(joints)), FitSettings())
+        found.append(global_rotations(fitted.rotations)[:, list(SCORED)])
+    return np.stack(found, axis=1)
 
 
 def _covariance(cleaned: product.Cleaned, turned: Floats) -> Floats:

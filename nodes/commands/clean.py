@@ -47,7 +47,7 @@ def clean(
 
     Args:
         source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
-            motion capture (.bvh, .trc, .c3d, AMASS .npz, .npy); a video; or a folder of these, with subfolders.
+            motion capture (.bvh, .trc, .c3d, AMASS .npz, .npy); a folder of these, with subfolders; or one video.
         out: the result: a recording, or an .npz or .csv with one row per input row; or a folder.
         delay: frames at 30 Hz that the output lags behind, 0 to 16; more is more accurate. Default 4.
         settings: override a setting of [prior], [trajectory] or [events], such as gate.enabled=false or
@@ -55,8 +55,8 @@ def clean(
             set smooth.weights, reconstruct.weights or trajectory.weights to their name or .safetensors file.
         skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
         rig: TOML file that describes motion capture which is not recognised: metres (length of its unit), up, fps,
-            skeleton (of arrays), and [canonical], its names of the joints of smpl22.
-        events: .csv to write what the people do to: a row an event, with its begin and end (docs/events.md).
+            skeleton (of .npy), and [canonical], which names its joint for each of smpl22 (docs/sources.md).
+        events: .csv file for what the people do: one row per event, with its begin and end (docs/events.md).
         jobs: for a folder, how many recordings to clean at once. Each takes about 1 GB of memory. Default: the
             number of cores.
         ray: clean a folder on a Ray cluster: the one of this machine or of RAY_ADDRESS, or else a new local one. All

@@ -52,9 +52,9 @@ def complete(
             NaN or confidence 0 where a joint is missing; or motion capture, as for 'clean'. In an .npz or .csv from
             'clean', imputed joints count as missing.
         out: the result: a recording, or an .npz or .csv.
-        optimise: also optimise HM-VAE's latents, then its decoder, for the motion that fits the known joints. Takes
-            several seconds per window of 64 frames and needs the extra 'train'. The error is not lower, but fast
-            motion is less smoothed.
+        optimise: then optimise the motion with HM-VAE, a generative model, to fit the known joints. Takes several
+            seconds per window of 64 frames and needs the extra 'train'. The error is not lower, but fast motion is
+            less smoothed.
         weights: weights of the completer: 'default', or a .safetensors file.
         skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
         rig: TOML file that describes motion capture which is not recognised: see 'clean'.

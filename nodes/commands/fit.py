@@ -41,10 +41,10 @@ def fit(
 ) -> int:
     """Fit a motion to a whole recording, offline, by optimisation with a learned motion model (HuMoR).
 
-    Starts from the result of `clean`, and optimises poses, bones and floor, so that joints match the observations,
-    steps are likely, and feet in contact stand still. Takes several seconds per second of recording and body. If it is
-    stopped, the same command resumes after the last finished window. If a fit fails, the result of `clean` is kept and
-    flagged as an anomaly.
+    Starts from the result of `clean`, and optimises poses, bone lengths and floor, so that joints match the
+    observations, the motion is likely, and feet in contact stand still. Takes several seconds per second of recording
+    and body. If it is stopped, the same command resumes after the last finished window. If a fit fails, the result of
+    `clean` is kept and flagged as an anomaly.
 
     Instead of positions, an .npz may contain 2D key points of one person from one camera: `keypoints` (T, J, 2)
     pixels, skeleton, fps or stamp_ns, `focal` and `centre` in pixels, and optionally confidence (T, J), `up` (default

@@ -66,7 +66,7 @@ def prepare(
         out: folder to write to.
         speeds: add training recordings of at least 50 frames per second at this speed. Repeatable.
         rig: TOML file that describes files which are not recognised: metres (length of their unit), up, fps, skeleton
-            (of arrays), and [canonical], their names of the joints of smpl22.
+            (of .npy), and [canonical], which names their joint for each of smpl22 (docs/sources.md).
     """
     console = Console()
     sources = find_sources(mocap)

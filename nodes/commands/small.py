@@ -17,8 +17,9 @@ from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 def keys(directory: Path) -> None:
     """Make a pair of CurveZMQ keys, so that only the subscribers that you list can receive messages.
 
-    Copy own.key of each subscribing machine into clients/ here, and own.key from here to those machines as
-    server.key. Then set `keys` to this folder, in [transport] of the launch file.
+    Make one on each machine. On the publishing machine, put own.key of each subscriber into clients/; on each
+    subscriber, save own.key of the publisher as server.key. Then set `keys` to this folder, in [transport] of the
+    launch file.
 
     Args:
         directory: folder for the keys. Keep own.key_secret secret.

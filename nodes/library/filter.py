@@ -47,7 +47,7 @@ class Filter:
         delay: frames at 30 Hz that the output lags behind, 0 to 16; more is more accurate.
         sensor_pose: pose of the sensor in the world, instead of ``up``. The floor is then at z = 0.
         settings: sections ``prior``, ``trajectory`` and ``events`` of a launch file.
-        events: whether to detect what people do. It takes about 2 % more time.
+        events: whether to detect what people do. It takes about 5 % more time.
 
     Attributes:
         problems: probable faults of the input so far, as text. Each is warned of once, as `InputWarning`.

@@ -149,7 +149,11 @@ class Poses(dict[str, NDArray[Any]]):
 
     @property
     def contacts(self) -> ByName:
-        """(8,) probability that a joint of `CONTACTS` (knees, ankles, feet, wrists) bears load, by joint."""
+        """(8,) probability that a joint of `CONTACTS` (knees, ankles, feet, wrists) bears load, by joint.
+
+        NaN, unknown, for a foot, ankle and toes, that was not observed for the last 2 s or never, and for its knee if
+        that was not either.
+        """
         return self._by_name("contacts")
 
     @property

@@ -4,7 +4,8 @@ The arrays have one row per input frame: ``stamp_ns`` (T,), ``positions`` (T, 22
 ``rotations`` (T, 22, 4) local, xyzw, ``state`` (T, 22) `msgs.types.JointState`, ``sigma`` (T, 22) metres, ``anomaly``
 (T,), ``anomaly_flag`` (T,), ``joint_anomaly`` (T, 22), ``contacts`` (T, 8), ``root_velocity`` (T, 3) m/s,
 ``world_positions`` (T, 22, 3) metres, and ``joint_names`` (22,). Where the prior has no body, numbers are NaN and the
-state is UNKNOWN. For several bodies, an axis of bodies follows time, and ``body_id`` (B,) lists their ids.
+state is UNKNOWN; unknown contacts are NaN too. For several bodies, an axis of bodies follows time, and ``body_id`` (B,)
+lists their ids.
 """
 
 from __future__ import annotations

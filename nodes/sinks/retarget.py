@@ -248,11 +248,11 @@ class Retargeter:
             elbow = shoulder + self._arm[k][0] * _direction(p, f"{side}_shoulder", f"{side}_elbow")
             self._set(f"{side}_elbow", None, elbow)
             self._set(f"{side}_wrist", None, elbow + self._arm[k][1] * _direction(p, f"{side}_elbow", f"{side}_wrist"))
-            touching = max(body.contacts[CONTACTS.index(f"{side}_{part}")] for part in ("ankle", "foot"))
+            touching = _touching(body, side)
             turn = turns[J[f"{side}_ankle"]] @ self._rest[f"{side}_foot"][0]
             place = self._to_robot(p[J[f"{side}_ankle"]])
             place[2] = max(place[2], self._sole)
-            self._set(f"{side}_foot", *self._held(k, turn, place, float(touching), dt, begun=begun))
+            self._set(f"{side}_foot", *self._held(k, turn, place, touching, dt, begun=begun))
 
     def _to_robot(self, point: Floats) -> Floats:
         """A point (3,) of the person, scaled to the robot's world."""
@@ -305,6 +305,12 @@ class Retargeter:
         q = self._configuration.q
         root = q[[0, 1, 2, 4, 5, 6, 3]].copy()
         return RobotPose(stamp_ns, root, q[self._q_indices].copy(), (self._feet[0].stands, self._feet[1].stands))
+
+
+def _touching(body: WorldBody, side: str) -> float:
+    """Probability that a foot stands; 1 if it is unknown, because a robot has to stand on something."""
+    heel, toes = (body.contacts[CONTACTS.index(f"{side}_{part}")] for part in ("ankle", "foot"))
+    return 1.0 if np.isnan(heel + toes) else float(max(heel, toes))
 
 
 def _direction(p: Floats, start: str, end: str) -> Floats:

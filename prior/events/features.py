@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import JointState, WorldBody
+from steadypose.msgs.types import CONTACTS, JointState, WorldBody
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 
 Point = list[float]
@@ -30,11 +30,12 @@ HIPS, SHOULDERS = (
 NARROW = 0.05
 """Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
 
-GUESSED = 0.1
-"""Standard deviation along an axis above which an unobserved ankle is only a guess, metres."""
-
 ANKLE, LEG_SIGMA = 0.07, 0.05
 """Height of a standing adult's ankle over the floor, and standard deviation of an unobserved leg's length, metres."""
+
+ANKLES = [J["left_ankle"], J["right_ankle"]]
+ANKLE_CONTACTS = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
+"""Ankles among joints and among `CONTACTS`; those of legs that are only guesses have no contacts."""
 
 EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
@@ -104,7 +105,7 @@ def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.n
     p: list[Point] = np.where(known[:, None], body.positions, np.nan).tolist()
     s: list[float] = body.sigma.tolist()
     hips = _middle(p[J["left_hip"]], p[J["right_hip"]])
-    ankle = min((J["left_ankle"], J["right_ankle"]), key=lambda joint: _last_if_nan(p[joint][2]))
+    ankle = min(ANKLES, key=lambda joint: _last_if_nan(p[joint][2]))
     leg = 0.5 * sum(
         _distance(p[J[f"{side}_{upper}"]], p[J[f"{side}_{lower}"]])
         for side in ("left", "right")
@@ -112,7 +113,7 @@ def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.n
     )
     extension = Quantity((hips[2] - p[ankle][2]) / leg, math.hypot(s[J["pelvis"]], s[ankle]) / leg)
     thigh = min((_thigh(p, s, side) for side in ("left", "right")), key=lambda q: _last_if_nan(q.value))
-    if all(not observed[joint] and s[joint] > GUESSED for joint in (J["left_ankle"], J["right_ankle"])):
+    if np.isnan(body.contacts[ANKLE_CONTACTS]).all() and not any(observed[joint] for joint in ANKLES):
         extension, thigh = _from_height(p, hips[2] - floor - ANKLE, leg, s[J["pelvis"]])
     heights = sorted((p[joint][2], joint) for joint in EXTENT if not math.isnan(p[joint][2]))
     if len(heights) > len(EXTENT) // 2:

@@ -3,6 +3,9 @@
 While the root is observed, joints keep their positions from `pose/clean`. The exceptions are resting feet, which stand
 still, and the leg joints that bones connect to them. While the root is unobserved, the whole body moves with its root.
 A body with both feet at rest is published as standing, with the root velocity of a swaying body.
+
+Legs that are only guesses (`legs`) have no contacts. Their feet may still be placed as if they stood, because a guess
+on the floor is better than one above it, but that makes them no more certain.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.world.core import BodyEstimate
+from steadypose.prior.world.legs import FEET_OF_LEGS, LEG_CONTACTS
 from steadypose.prior.world.observe import FEET
 
 LENGTH_SIGMA = 0.025
@@ -148,7 +152,8 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
     moved = observed.positions + root.shift
     placed = np.isfinite(root.feet[:, 0])
     joints = np.array(FEET)[placed]
-    moved[joints], sigma[joints] = estimate.feet.positions[placed], estimate.feet.sigma[placed]
+    least = np.where(estimate.guessed[FEET_OF_LEGS][placed], sigma[joints], 0.0)
+    moved[joints], sigma[joints] = estimate.feet.positions[placed], np.maximum(estimate.feet.sigma[placed], least)
     moved[0], sigma[0] = root.position, math.sqrt(float(np.mean(spread**2)))
     positions = fit_legs(moved, sigma, observed.body.bone_lengths)
     rotations = observed.body.rotations.astype(np.float64)
@@ -158,6 +163,8 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
     known = np.isfinite(positions).all(axis=1) & np.isfinite(sigma)
     tracking = Tracking.OK if observed.root_observed else Tracking.COASTING
     both_rest = float(rest.reshape(2, 2).max(axis=0).min()) if observed.root_observed else 0.0
+    contacts = estimate.contacts.load.copy()
+    contacts[LEG_CONTACTS][estimate.guessed] = np.nan
     stated = VELOCITY_STATED if observed.pelvis_observed else 1.0
     velocity, covariance = standing_velocity(root.velocity, root.covariance, both_rest, stated=stated)
     return WorldBody(
@@ -170,7 +177,7 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
         rotations=rotations,
         state=np.where(known, observed.body.state, JointState.UNKNOWN),
         sigma=sigma,
-        contacts=estimate.contacts.load,
+        contacts=contacts,
         tracking=Tracking.LOST if math.hypot(*spread[:2]) > lost_sigma else tracking,
     )
 

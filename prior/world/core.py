@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from steadypose.prior.arrays import Bools
 from steadypose.prior.models.contacts import Contacts
 from steadypose.prior.world.feet import Feet, FeetState
 from steadypose.prior.world.filter import RootFilter, RootState
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
+from steadypose.prior.world.legs import FEET_OF_LEGS, LegMemory
 from steadypose.prior.world.networks import (
     ContactMemory,
     ContactNetwork,
@@ -35,6 +37,7 @@ class BodyEstimate:
         observed: the input.
         velocity: predicted root velocity; None if the network is off.
         contacts: predicted contacts.
+        guessed: (6,) which joints of legs (`LEG_CONTACTS`) are only guesses.
         stance: feet that may anchor the root.
         root: the filter's estimate of root and feet.
         feet: feet for publication.
@@ -43,6 +46,7 @@ class BodyEstimate:
     observed: BodyObservation
     velocity: RootVelocity | None
     contacts: Contacts
+    guessed: Bools
     stance: Stance
     root: RootState
     feet: FeetState
@@ -56,6 +60,7 @@ class BodyStages:
     motion: MotionMemory
     contacts: ContactMemory
     filter: RootFilter
+    legs: LegMemory = field(default_factory=LegMemory)
     feet: Feet = field(default_factory=Feet)
 
 
@@ -113,11 +118,12 @@ class WorldCore:
         all_contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
         estimates = []
         for body, now, velocity, contacts in zip(bodies, observed, velocities, all_contacts, strict=True):
+            guessed = body.legs.update(now)
             holding = stance(contacts, now, body.filter.feet_off) if self._anchors else _NO_STANCE
-            scene.floor.update(now, holding.rest)
+            scene.floor.update(now, holding.rest, guessed[FEET_OF_LEGS])
             root = body.filter.update(now, velocity, holding, scene.floor)
             feet = body.feet.update(now, root, holding.rest, scene.floor)
-            estimates.append(BodyEstimate(now, velocity, contacts, holding, root, feet))
+            estimates.append(BodyEstimate(now, velocity, contacts, guessed, holding, root, feet))
         return estimates
 
     def _stages(self, scene: Scene, observed: BodyObservation) -> BodyStages:

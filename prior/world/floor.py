@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.models.root_velocity import FRAME_S
 from steadypose.prior.world.observe import BodyObservation
 
@@ -140,14 +140,18 @@ class Floor:
         near = min(heights, key=lambda height: abs(height - sole[2]))
         return near if sole[2] - near < STEP_M else math.nan
 
-    def update(self, observed: BodyObservation, rest: Floats) -> None:
-        """Update with one body's observed feet and their probabilities (4,) of ``rest``."""
+    def update(self, observed: BodyObservation, rest: Floats, guessed: Bools) -> None:
+        """Update with one body's feet and their probabilities (4,) of ``rest``.
+
+        Feet that are only ``guessed`` (4,) may start a floor, because nothing else may ever, but not move one. The legs
+        of somebody who sits behind a counter are guessed to stand, deep under the floor.
+        """
         if not self.known and observed.feet_observed.any():
             self.guess(float(np.nanmin(observed.soles[:, 2])))
         if not observed.root_observed:
             return
         soles, sigma = observed.soles, observed.feet_sigma
-        stands = (rest > STANDING) & np.isfinite(soles).all(axis=1) & np.isfinite(sigma)
+        stands = (rest > STANDING) & np.isfinite(soles).all(axis=1) & np.isfinite(sigma) & ~(guessed & self.known)
         for k in np.flatnonzero(stands & (observed.positions[0, 2] - soles[:, 2] > UPRIGHT_M)):
             self.observe(soles[k], math.hypot(sigma[k], SOLE_SIGMA), max(observed.dt, FRAME_S))
 

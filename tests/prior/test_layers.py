@@ -30,8 +30,11 @@ MODULES = {
 
 def imports(path: Path) -> set[str]:
     """Modules of this project that a module imports, wherever in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    found, waiting = set(), list[ast.AST](ast.parse(path.read_text()).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):  # expressions have none
+            waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose."):
             parent = (node.module or "").removeprefix("steadypose.")
             children = {f"{parent}.{alias.name}" for alias in node.names}

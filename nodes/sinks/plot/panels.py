@@ -67,7 +67,7 @@ def panels_over_time(history: History, body: int, errors: dict[str, TrackError])
             panels.append(Panel(f"{JOINTS[joint]}, world, m", 1.25, lambda ax, j=joint: _draw_raw_joint(ax, raw, j)))
         panels.append(Panel("joints the sensor gave", 3.0, lambda ax: _draw_observed(ax, raw, history.observable)))
     if world is not None:
-        panels.append(Panel("contacts", 1.0, lambda ax: _draw_contacts(ax, world)))
+        panels.append(Panel("contacts", 1.0, lambda ax: draw_contacts(ax, world)))
     if errors:
         panels.append(
             Panel(
@@ -166,16 +166,23 @@ def _draw_anomaly(ax: Axes, clean: Track) -> None:
         ax.legend(loc="upper right", fontsize=7)
 
 
-def _draw_contacts(ax: Axes, world: Track) -> None:
+def draw_contacts(ax: Axes, world: Track) -> None:
+    """Draw the probability of each contact, grey where it is unknown, and when the root is not observed."""
     time, contacts, tracking = with_gaps(world.time, world.contacts, world.tracking)
     for row in range(len(CONTACTS)):
         ax.fill_between(time, row, row + 0.85 * np.clip(contacts[:, row], 0, 1), color=WORLD_COLOUR, linewidth=0)
+    unknown = np.isnan(contacts)
+    rows = np.flatnonzero((unknown[1:] & unknown[:-1]).any(axis=0)).tolist()  # a gap of the track is one NaN
+    for row in rows:
+        grey, label = STATE_COLOURS[JointState.UNKNOWN], "unknown" if row == rows[0] else None
+        ax.fill_between(time, row, row + 0.85, where=unknown[:, row], color=grey, alpha=0.3, linewidth=0, label=label)
     for state, colour in ((Tracking.COASTING, STATE_COLOURS[JointState.IMPUTED]), (Tracking.LOST, ALARM_COLOUR)):
         here = tracking == state
         if here.any():
             label = state.name.lower()
             ax.fill_between(time, 0, len(CONTACTS), where=here, color=colour, alpha=0.2, linewidth=0, label=label)
-            ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=7, frameon=False)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, fontsize=7, frameon=False)
     ax.set_yticks(np.arange(len(CONTACTS)) + 0.4, CONTACTS, fontsize=6)
     ax.set_ylim(len(CONTACTS), 0)
 

@@ -31,20 +31,6 @@ def test_help_lists_every_command_and_imports_almost_nothing() -> None:
     assert out.endswith("bundled stream.\n"), "and none of those modules"
 
 
-def test_what_needs_no_torch_does_not_import_it() -> None:
-    code = """
-import sys
-from steadypose.nodes.cli import main
-for command in ("run", "node", "keys", "echo", "info"):
-    try:
-        main([command, "--help"])
-    except SystemExit as end:
-        assert end.code == 0
-    assert "torch" not in sys.modules, command
-"""
-    python(code)
-
-
 def test_every_command_is_where_it_is_said_to_be() -> None:
     for command, (module, _) in COMMANDS.items():
         spec = find_spec(module if "." in module else f"steadypose.nodes.commands.{module}")
@@ -127,7 +113,7 @@ def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
     assert "exists already" in capsys.readouterr().err
 
 
-def test_what_an_extra_brings_is_named() -> None:
+def test_what_needs_no_torch_does_not_import_it_and_what_an_extra_brings_is_named() -> None:
     lacking = {
         "torch": ("train", ["train", "hmvae"]),
         "matplotlib": ("view", ["plot", "x"]),
@@ -138,6 +124,12 @@ def test_what_an_extra_brings_is_named() -> None:
 import sys
 from contextlib import redirect_stderr
 from steadypose.nodes.cli import USAGE_ERROR, main
+for command in ("run", "node", "keys", "echo", "info"):
+    try:
+        main([command, "--help"])
+    except SystemExit as end:
+        assert end.code == 0
+    assert "torch" not in sys.modules, command
 for missing, (_, arguments) in {lacking}.items():
     sys.modules[missing] = None
     with redirect_stderr(sys.stdout):

@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw
+from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.plot import plot
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path
-from steadypose.nodes.sinks.plot.panels import busiest_joints
+from steadypose.nodes.sinks.plot.panels import busiest_joints, draw_contacts
 from steadypose.prior.body.skeleton import J
 
 GONE = object()
@@ -78,6 +79,24 @@ def test_draws_frames_in_which_nothing_is_seen(tmp_path: Path) -> None:
             message.bodies[0].anomaly = np.nan
 
     assert drawn(record(tmp_path / "bag", 1.0, change=hide))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("hidden", [True, False])
+def test_contacts_that_are_unknown_are_drawn_as_such(tmp_path: Path, hidden: bool) -> None:
+    """And not those between two parts of a stream."""
+
+    def hide(_: str, message: Message) -> object:
+        if isinstance(message, PoseWorld) and hidden:
+            message.bodies[0].contacts[2:6] = np.nan
+        return GONE if 2 * 10**9 < message.stamp_ns < 3 * 10**9 else None
+
+    world = history_of_path(record(tmp_path / "bag", 3.0, change=hide)).track(POSE_WORLD, 0)
+    assert world is not None
+    ax = Figure().subplots()
+    draw_contacts(ax, world)
+    legend = ax.get_legend()
+    assert [text.get_text() for text in (legend.get_texts() if legend else ())] == ["unknown"] * hidden
 
 
 def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:

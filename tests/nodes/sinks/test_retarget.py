@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import PoseWorld
+from steadypose.msgs.types import CONTACTS, PoseWorld
 from steadypose.nodes.cli import main
 from steadypose.nodes.graph.launch import Launch, bundled
 from steadypose.nodes.settings import LaunchError
@@ -64,7 +64,7 @@ def followed(robot: Robot, stream: list[PoseWorld]) -> tuple[list[RobotPose], ND
     "name", ["walk_turn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sit_rise", "wave_hidden_arm"))]
 )
 def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: Robot, name: str) -> None:
-    poses, away = followed(robot, worlds(name))
+    poses, away = followed(robot, worlds(name)[:240])
     joints = np.array([pose.joints for pose in poses])
     assert (joints >= robot.lower).all()
     assert (joints <= robot.upper).all()
@@ -106,14 +106,26 @@ def test_it_begins_and_stops_smoothly(robot: Robot) -> None:
 
 
 def test_the_next_person_is_followed_when_the_first_has_gone_without_a_jump_of_the_joints(robot: Robot) -> None:
-    stream = worlds("crossing")[:200]
-    follower, poses, leaves_ns = Follower(Retargeter(robot)), [], stream[100].stamp_ns
+    stream = worlds("crossing")[:160]
+    follower, poses, leaves_ns = Follower(Retargeter(robot)), [], stream[60].stamp_ns
     for world in stream:
         gone = leaves_ns <= world.stamp_ns < leaves_ns + GONE_NS
         there = [body for body in world.bodies if not gone and (body.id == 1) == (world.stamp_ns < leaves_ns)]
         poses.append(follower.process(replace(world, bodies=there)))
     joints = np.array([pose.joints for pose in poses if pose])
     assert (np.abs(np.diff(joints, axis=0)) <= robot.speed * FRAME_S * 1.01).all()
+
+
+def test_on_feet_of_unknown_contact_the_robot_stands(robot: Robot) -> None:
+    """Of one foot at a time: it is held in place, although the person walks, and the other is not."""
+    for k, side in enumerate(SIDES):
+        stream = worlds("walk_turn")[:120]
+        for world in stream:
+            world.bodies[0].contacts[:] = 0.0
+            world.bodies[0].contacts[[CONTACTS.index(f"{side}_{part}") for part in ("ankle", "foot")]] = np.nan
+        stands = np.array([pose.stands for pose in followed(robot, stream)[0]])
+        assert stands[-60:, k].mean() > 0.5
+        assert not stands[:, 1 - k].any()
 
 
 def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:

@@ -147,12 +147,14 @@ def test_messages_as_json() -> None:
     message = world(1_500_000_000)
     message.bodies[0].positions[3] = np.nan
     message.bodies[0].sigma[4] = np.inf
+    message.bodies[0].contacts[2] = np.nan
     said = json.loads(to_json(message) or "")
     (body,) = said["bodies"]
     assert (said["topic"], said["stamp"], said["frame"]) == ("pose/world", 1.5, "world")
     assert (body["id"], body["tracking"], body["positions"][2]) == (7, "COASTING", [6.0, 7.0, 8.0])
     assert body["positions"][3] == [None] * 3
     assert body["sigma"][4] is None
+    assert [contact is None for contact in body["contacts"]] == [k == 2 for k in range(8)]
     (event,) = json.loads(to_json(events()) or "")["events"]
     assert (event["kind"], event["phase"], event["hand"], event["direction"]) == ("POINTS", "BEGINS", "LEFT", [1, 0, 0])
     assert json.loads(to_json(diagnostics()) or "")["values"]["rate"] == "30.0"

@@ -28,7 +28,7 @@ SIMPLE: dict[str, Any] = {stage: {"enabled": False} for stage in ("score", "impu
 
 @pytest.fixture(scope="module")
 def frames() -> list[PoseRaw]:
-    return stream(waving(40), START_NS)
+    return stream(waving(26), START_NS)
 
 
 @pytest.fixture(scope="module")
@@ -40,29 +40,29 @@ def answers(frames: list[PoseRaw]) -> list[PoseClean]:
 def test_one_wrong_stamp_changes_nothing_but_a_count(
     frames: list[PoseRaw], answers: list[PoseClean], wrong_ns: int
 ) -> None:
-    wrong = dataclasses.replace(frames[20], stamp_ns=wrong_ns)
-    found, prior = clean([*frames[:20], wrong, *frames[20:]], **SIMPLE)
+    wrong = dataclasses.replace(frames[12], stamp_ns=wrong_ns)
+    found, prior = clean([*frames[:12], wrong, *frames[12:]], **SIMPLE)
     assert found == answers
     assert prior.counters == {"stamp_outlier": 1}
 
 
 @pytest.mark.parametrize("shift_ns", [3 * SECOND_NS, -3 * SECOND_NS, YEAR_2037_NS - START_NS])
 def test_a_clock_that_was_set_loses_no_frame(frames: list[PoseRaw], shift_ns: int) -> None:
-    later = [dataclasses.replace(frame, stamp_ns=frame.stamp_ns + shift_ns) for frame in frames[20:]]
-    found, prior = clean([*frames[:20], *later], **SIMPLE)
-    assert [answer.stamp_ns for answer in found] == [frame.stamp_ns for frame in [*frames[:20], *later]]
+    later = [dataclasses.replace(frame, stamp_ns=frame.stamp_ns + shift_ns) for frame in frames[12:]]
+    found, prior = clean([*frames[:12], *later], **SIMPLE)
+    assert [answer.stamp_ns for answer in found] == [frame.stamp_ns for frame in [*frames[:12], *later]]
     assert all(answer.bodies for answer in found)
     assert not prior.counters["stamp_outlier"]
 
 
 def test_a_stream_that_ends_within_the_jump_is_answered(frames: list[PoseRaw]) -> None:
     late = [
-        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS) for frame in frames[20 : 20 + LASTING - 1]
+        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS) for frame in frames[12 : 12 + LASTING - 1]
     ]
-    assert len(clean([*frames[:20], *late], **SIMPLE)[0]) == 20 + LASTING - 1
+    assert len(clean([*frames[:12], *late], **SIMPLE)[0]) == 12 + LASTING - 1
     end = dataclasses.replace(late[-1], bodies=[], end_of_stream=True)
-    found, _ = clean([*frames[:20], *late, end], **SIMPLE)
-    assert len(found) == 20 + LASTING
+    found, _ = clean([*frames[:12], *late, end], **SIMPLE)
+    assert len(found) == 12 + LASTING
     assert found[-1].end_of_stream
 
 
@@ -73,7 +73,7 @@ def test_a_server_drops_a_wrong_stamp_of_one_stream_alone(frames: list[PoseRaw])
         now_ns = frame.stamp_ns + 1_000_000
         for source in ("door", "desk"):
             message = dataclasses.replace(frame, source=source)
-            if (index, source) == (20, "door"):
+            if (index, source) == (12, "door"):
                 found += server.process_at(dataclasses.replace(message, stamp_ns=YEAR_2037_NS), now_ns)
             found += server.process_at(message, now_ns)
     for source in ("door", "desk"):

@@ -270,7 +270,7 @@ class TestBadInput:
 def test_to_keep_only_stamps_while_nobody_is_there_changes_nothing(delay: int, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = noisy(15, 0.02)
     visits = [[{id_: frame} for frame in seen] for id_ in (3, 4)]
-    nobody = [{}] * 100
+    nobody = [{}] * 95
     people = [*visits[0], *nobody, *visits[1], *visits[0]]
     messages = [raw(10**9 + k * PERIOD_NS, present) for k, present in enumerate(people)]
     idle = [encode(c) for c in clean(messages, delay=delay)[0]]
@@ -316,11 +316,11 @@ def test_a_body_wholly_hidden_for_a_moment_stays_about_where_it_was() -> None:
     assert error[30:42].max() < 0.4
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.02])
-def test_the_noise_of_the_sensor_is_found(sigma: float) -> None:
+@pytest.mark.parametrize(("sigma", "frames"), [(0.0, 60), (0.02, 165)])
+def test_the_noise_of_the_sensor_is_found(sigma: float, frames: int) -> None:
     pipeline = PriorPipeline(PriorSettings())
     assert pipeline.sensor_noise is None
-    for message in stream(noisy(165, sigma)):
+    for message in stream(noisy(frames, sigma)):
         pipeline.process(message)
     found = pipeline.sensor_noise
     assert found is not None

@@ -138,7 +138,7 @@ def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits
         seen[guessed] = (standing() - standing()[J["pelvis"]])[guessed] + hips
         world = message(index, seen + [0.0, 0.0, height])
         body = world.bodies[0]
-        body.state[guessed], body.sigma[guessed] = JointState.IMPUTED, 0.14
+        body.state[guessed], body.contacts[:6] = JointState.IMPUTED, np.nan
         world.ground_plane[3] = -height
         found += [(index, event.kind, event.hand, event.phase) for event in
                   detector.update(world, calibrated=calibrated) if event.phase != Phase.HOLDS]  # fmt: skip

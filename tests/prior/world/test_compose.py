@@ -86,13 +86,15 @@ def test_rotations_that_are_none_are_left_alone():
     np.testing.assert_array_equal(turn_legs(rotations, positions, positions + 0.01), rotations)
 
 
-def composed(lost_sigma: float = 0.5, speed: float = 2.0, **fields: Any) -> tuple[WorldBody, BodyEstimate]:
+def composed(
+    lost_sigma: float = 0.5, speed: float = 2.0, guessed: tuple[bool, ...] = (False,) * 6, **fields: Any
+) -> tuple[WorldBody, BodyEstimate]:
     """A body that moves on resting feet as published, heels 5 cm from where they are seen, and no toes."""
     rotations, positions = pose(6)
     body = clean_body(positions, id=3, rotations=rotations, bone_lengths=np.zeros(22))
     observed = BodyObservation(
-        body, 0, 1 / 30, positions.copy(), np.array([0.0, 0.0, 0.6, 0.8]), np.ones(22, dtype=bool), np.full(22, 0.01),
-        **({"root_sigma": 0.02, "pelvis_observed": True} | fields),
+        body, 0, 1 / 30, positions.copy(), np.array([0.0, 0.0, 0.6, 0.8]), np.ones(22, dtype=bool),
+        **({"sigma": np.full(22, 0.01), "root_sigma": 0.02, "pelvis_observed": True} | fields),
     )  # fmt: skip
     heels = np.full((4, 3), np.nan)
     heels[:2] = observed.feet[:2] + [0.05, 0.0, 0.0]
@@ -104,7 +106,8 @@ def composed(lost_sigma: float = 0.5, speed: float = 2.0, **fields: Any) -> tupl
     ramp = np.linspace(0, 1, 8, dtype=np.float32)
     contacts = Contacts(ramp, ramp[::-1], ramp[:1])
     rest = np.array([0.9, 0.0, 0.0, 0.8])
-    estimate = BodyEstimate(observed, None, contacts, Stance(rest, rest), root, FeetState(heels, np.full(4, 0.03)))
+    feet = FeetState(heels, np.full(4, 0.03))
+    estimate = BodyEstimate(observed, None, contacts, np.array(guessed), Stance(rest, rest), root, feet)
     return compose(estimate, lost_sigma), estimate
 
 
@@ -124,6 +127,20 @@ def test_joints_are_published_where_and_as_surely_as_root_and_feet_are_estimated
     np.testing.assert_allclose(body.rotations[0], [0.0, 0.0, 0.6, 0.8], atol=1e-6)
     np.testing.assert_allclose(body.contacts, np.linspace(0, 1, 8), atol=1e-6)
     assert (body.state == JointState.SEEN).all()
+
+
+def test_of_a_guessed_leg_no_contact_is_published_and_its_foot_is_as_uncertain_as_it_was_said_to_be() -> None:
+    """Of the left leg only, and whichever of the two deviations of its heel is larger."""
+    said = np.full(22, 0.01)
+    said[[J["left_ankle"], J["right_ankle"]]] = 0.14
+    guessed = (False, False, True, False, True, False)
+    body, estimate = composed(guessed=guessed, sigma=said)
+    np.testing.assert_array_equal(np.isnan(body.contacts), [*guessed, False, False])
+    np.testing.assert_allclose(body.contacts[[0, 1, 3, 5, 6, 7]], np.linspace(0, 1, 8)[[0, 1, 3, 5, 6, 7]], atol=1e-6)
+    assert body.sigma[[J["left_ankle"], J["right_ankle"]]].tolist() == pytest.approx([0.14, 0.03])
+    assert np.isfinite(estimate.contacts.load).all(), "the estimate itself is left alone"
+    surer, _ = composed(guessed=guessed)
+    assert surer.sigma[J["left_ankle"]] == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize(("lost_sigma", "lost"), [(0.51, False), (0.49, True)])

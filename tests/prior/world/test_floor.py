@@ -39,7 +39,7 @@ def test_uncalibrated_floor_is_unknown_then_found():
 def test_it_is_guessed_from_feet_that_are_seen(seen: bool):
     floor, soles = Floor(calibrated=False), np.array([[0.0, 0.0, height] for height in (-1.1, -1.2, -1.2, -1.15)])
     observed: Any = SimpleNamespace(feet_observed=np.full(4, seen), soles=soles, root_observed=False)
-    floor.update(observed, np.ones(4))
+    floor.update(observed, np.ones(4), np.zeros(4, dtype=bool))
     assert floor.known == seen
     assert floor.height == (-1.2 if seen else 0.0)
 
@@ -156,9 +156,24 @@ def test_only_feet_that_rest_under_an_upright_body_with_an_observed_root_measure
             soles=np.tile([0.0, 0.0, 0.01], (4, 1)), feet_sigma=np.full(4, sigma), feet_observed=np.ones(4, bool),
             positions=np.array([[0.0, 0.0, pelvis + 0.01]]), root_observed=root, dt=1.0,
         )  # fmt: skip
-        floor.update(now, np.array([rest, 0.0, 0.0, 0.0]))
+        floor.update(now, np.array([rest, 0.0, 0.0, 0.0]), np.zeros(4, dtype=bool))
         return floor.height
 
     variance = 0.01**2 + 0.001**2
     assert moved() == pytest.approx(0.01 * variance / (variance + 0.01**2 + 0.02**2))
     assert moved(rest=0.49) == moved(pelvis=0.44) == moved(root=False) == moved(sigma=np.inf) == 0.0
+
+
+@pytest.mark.parametrize(("calibrated", "guessed"), [(True, True), (True, False), (False, True)])
+def test_feet_that_are_guessed_start_a_floor_and_never_move_one(calibrated: bool, guessed: bool) -> None:
+    """They are guessed 20 cm too low, then 40."""
+    floor = Floor(calibrated)
+    for height in (-0.2, -0.4):
+        observed: Any = SimpleNamespace(
+            feet_observed=np.full(4, not guessed), root_observed=True, positions=np.array([[0.0, 0.0, 0.8]]), dt=DT,
+            soles=np.array([[0.1 * k, 0.0, height] for k in range(4)]), feet_sigma=np.full(4, 0.02),
+        )  # fmt: skip
+        for _ in range(60):
+            floor.update(observed, np.ones(4), np.full(4, guessed))
+    expected = (0.0 if calibrated else -0.2) if guessed else -0.4
+    assert floor.height == pytest.approx(expected, abs=0.01)

@@ -30,8 +30,8 @@ export interface Body {
   state: number[];
   /** metres, standard deviation of a position along an axis */
   sigma: (number | null)[];
-  /** probabilities, in the order of Names.contacts */
-  contacts: number[];
+  /** probabilities, in the order of Names.contacts; null for legs that were not observed for the last 2 s or never */
+  contacts: (number | null)[];
   /** position of a joint by name; null where there is no estimate */
   joint(name: string): Vector | null;
 }
