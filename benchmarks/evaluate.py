@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from steadypose.benchmarks.studies import PREPARED, SENSORS, STUDIES
+from steadypose.benchmarks.studies import NO_SPLIT, PREPARED, SENSORS, STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def evaluate(
             if (needed := _missing(name, mocap, data)) is not None:
                 console.print(f"{name}: left out, it needs {needed}", highlight=False)
                 continue
-            if split == "test" and name not in (*SENSORS, *SYSTEMS) and data.is_file():
+            if split == "test" and name not in (*NO_SPLIT, *SYSTEMS) and data.is_file():
                 log_reading(name)
             started = time.perf_counter()
             room = "systems" if name in SYSTEMS else "studies"

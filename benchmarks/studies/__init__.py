@@ -30,5 +30,8 @@ SENSORS = {
 }
 """Studies with their own recordings, and the file of each."""
 
+NO_SPLIT = ("kinect_vicon", "mediapipe", "contacts")
+"""Studies of recordings that have no test split, so that reading them is not logged."""
+
 PREPARED = ("event_mocap",)
 """Studies that need prepared motion and cannot use simulated people instead."""

@@ -47,12 +47,12 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
     read("kinect_vicon", "test")  # has no split
     assert not log.exists()
     read("world", "test")
-    read("fidelity", "test")
+    read("rotations", "test")  # has one, beside a sensor's recordings
     found = machine()
     assert log.read_text().splitlines() == [
         "date,commit,study,what followed",
         f"{found['date']},{found['commit']},world,",
-        f"{found['date']},{found['commit']},fidelity,",
+        f"{found['date']},{found['commit']},rotations,",
     ]
 
 
