@@ -14,6 +14,7 @@ STUDIES: dict[str, str] = {
     "completion": "a part of the body from the rest",
     "hgvae": "likelihood, anomalies, imputation (the HG-VAE paper)",
     "world": "root drift and foot skate",
+    "counter": "simulated people behind a counter: heading, place, height, sitting or standing",
     "contacts": "load of feet, against force plates",
     "humor": "futures, noisy and hidden joints, a simulated detector and depth camera (the HuMoR paper)",
     "humor_credit": "what a fit owes to HuMoR's transition model and contacts",
@@ -30,8 +31,8 @@ SENSORS = {
 }
 """Studies with their own recordings, and the file of each."""
 
-NO_SPLIT = ("kinect_vicon", "mediapipe", "contacts")
-"""Studies of recordings that have no test split, so that reading them is not logged."""
+NO_SPLIT = ("kinect_vicon", "mediapipe", "contacts", "counter")
+"""Studies of people that have no test split, so that reading them is not logged."""
 
 PREPARED = ("event_mocap",)
 """Studies that need prepared motion and cannot use simulated people instead."""
