@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import product
+from steadypose.benchmarks.baselines.rotations import (
+    DENSITIES,
+    RotationNet,
+    predict_rotations,
+    smooth_rotations,
+    train_rotations,
+)
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
 from steadypose.benchmarks.intervals import Interval, ratio
@@ -56,7 +64,7 @@ from steadypose.prior.body.kinematics import (
 )
 from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
 from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.settings import OrientSettings, PriorSettings
+from steadypose.prior.clean.settings import OrientSettings, PriorSettings, RefineSettings
 from steadypose.prior.fit.bodies import lowest_floor
 from steadypose.prior.fit.solve import FitSettings, Start
 from steadypose.prior.fit.windows import Track, fit_track
@@ -155,14 +163,36 @@ DEPENDS_ON = (*VARIANTS, "humor weights", "prior.fit")
 
 DELAY, FIT_DELAY = PriorSettings().delay, 8
 """Delays of the live output that is scored, and of that from which fits start, frames."""
-LASTING_S = 0.5
-"""Correlation time of time-correlated noise (to 1 / e), seconds."""
+LASTING = math.exp(-1.0 / (0.5 * FPS))
+"""Correlation between frames of noise that lasts for half a second (to 1 / e)."""
+CAMERA_M, DEPTH = 4.0, 4.0
+"""Distance of a camera from the middle of a clip, metres; its errors along the line of sight over those across it."""
 PERFECT, AIMED, STEADYPOSE, FIT = "none", "aimed bones", "steadypose", "`steadypose fit`, offline"
+FILTERED, REGRESSED = "raw joints' aimed bones, Kalman filter", "positions to rotations, GRU"
 METHODS: Mapping[str, PriorSettings] = {
     AIMED: PriorSettings(orient=OrientSettings(enabled=False)),
     "HM-VAE, one pass": product.PRODUCT["HM-VAE"],
     STEADYPOSE: PriorSettings(),
+    "steadypose with HM-VAE, which is off": PriorSettings(refine=RefineSettings(enabled=True)),
 }
+
+
+def depth_errors(truth: Floats, rng: np.random.Generator) -> Floats:
+    """Add noise to (T, C, 22, 3) that lasts, 1 cm across the line of sight of a camera and 4 cm along it."""
+    seen = correlated(truth, 0.01, rng, LASTING)
+    sight = truth - truth.mean(axis=(0, 2), keepdims=True) - (CAMERA_M, 0.0, 0.0)
+    sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+    return seen + (DEPTH - 1.0) * ((seen - truth) * sight).sum(axis=-1, keepdims=True) * sight
+
+
+CONDITIONS: Mapping[str, Callable[[Floats, np.random.Generator], Floats]] = {
+    PERFECT: lambda truth, _: truth,
+    "white, 1 cm": lambda truth, rng: gaussian(truth, 0.01, rng),
+    "white, 2 cm": lambda truth, rng: gaussian(truth, 0.02, rng),
+    "lasting, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng, LASTING),
+    "a camera's depth, lasting": depth_errors,
+}
+"""Errors of joints (T, C, 22, 3), metres."""
 
 
 _PARTS = {"pelvis": ("hip",), "trunk": ("hip", "shoulder")}
@@ -181,18 +211,16 @@ def run(bench: Bench) -> Result:
     assert bench.mocap is not None
     clips = read(bench.mocap, bench.split, 4 if bench.quick else 8)
     rng, scored = np.random.default_rng(bench.seeds[0]), slice(SKIPPED, None)
-    conditions = {
-        PERFECT: clips.positions,
-        "white, 1 cm": gaussian(clips.positions, 0.01, rng),
-        "white, 2 cm": gaussian(clips.positions, 0.02, rng),
-        "lasting, 2 cm": correlated(clips.positions, 0.02, rng, math.exp(-1.0 / (LASTING_S * FPS))),
-    }
-    roots = baselines(bench.training_clips(), bench.seeds[0])
+    training = bench.training_clips()
+    roots = baselines(training, bench.seeds[0])
+    track = partial(bench.progress.track, description=REGRESSED)
+    net = train_rotations(training, SCORED, DELAY, 20 if bench.quick else 3000, track)
     perfect: dict[str, Floats] = {}
     plain = np.full(len(clips.person), np.nan)
     records: list[dict[str, Any]] = []
-    for condition, seen in bench.progress.track(conditions.items(), description="rotations"):
-        for method, found in _answers(seen, roots).items():
+    for condition, corrupt in bench.progress.track(CONDITIONS.items(), description="rotations"):
+        seen, density = corrupt(clips.positions, rng), best_density(training.every(20).positions, corrupt)
+        for method, found in _answers(seen, roots, net, density).items():
             own = perfect.setdefault(method, found.orientations)
             record: dict[str, Any] = {"method": method, "noise": condition}
             for against, truth in (("noise alone", own), ("file", align(clips.orientations, own))):
@@ -220,22 +248,35 @@ def _rounded(found: Interval) -> list[float]:
     return [round(value, 3) for value in (found.mean, found.low, found.high)]
 
 
-def _answers(seen: Floats, roots: Mapping[str, Baseline]) -> dict[str, _Turned]:
+def best_density(truth: Floats, corrupt: Callable[[Floats, np.random.Generator], Floats]) -> float:
+    """Return the process density of `smooth_rotations` with the least error on training clips (T, C, 22, 3) in this
+    noise."""
+    seen, wanted = aimed(corrupt(truth, np.random.default_rng(0))), aimed(truth)
+    return min(DENSITIES, key=lambda d: np.median(angle(smooth_rotations(seen, d, DELAY).swapaxes(-1, -2) @ wanted)))
+
+
+def aimed(joints: Floats) -> Floats:
+    """Return the orientations (T, C, 17, 3, 3) of each frame's bones, aimed at joints (T, C, 22, 3)."""
+    clips = [global_rotations(solve_rotations(one, estimate_offsets(one))) for one in joints.swapaxes(0, 1)]
+    return np.stack(clips, axis=1)[:, :, list(SCORED)]
+
+
+def _answers(seen: Floats, roots: Mapping[str, Baseline], net: RotationNet, density: float) -> dict[str, _Turned]:
     """Run all methods on joints (T, C, 22, 3)."""
     found: dict[str, _Turned] = {}
-    joints = seen
+    joints, unknown = seen, np.full((*seen.shape[:2], 3, 3), np.nan)
     for name, settings in METHODS.items():
         cleaned = product.run(settings, seen, np.arange(len(seen)) / FPS, DELAY)
         turned = global_rotations(_matrices(cleaned.rotations))[:, :, list(SCORED)]
-        found[name] = _Turned(
-            turned, _covariance(cleaned, turned) if name == STEADYPOSE else np.full((*turned.shape[:2], 3, 3), np.nan)
-        )
+        found[name] = _Turned(turned, _covariance(cleaned, turned) if name == STEADYPOSE else unknown)
         joints = cleaned.positions if name == STEADYPOSE else joints
-    found[FIT] = _Turned(_fitted(seen), np.full((*seen.shape[:2], 3, 3), np.nan))
+    found[FIT] = _Turned(_fitted(seen), unknown)
+    found[FILTERED] = _Turned(smooth_rotations(aimed(seen), density, DELAY), unknown)
+    found[REGRESSED] = _Turned(predict_rotations(net, seen), unknown)
     for name, root in roots.items():  # of the root only, from the joints that steadypose publishes
         turned = found[AIMED].orientations.copy()
         turned[:, :, 0] = root(joints.reshape(-1, 22, 3)).reshape(turned[:, :, 0].shape)
-        found[name] = _Turned(turned, np.full((*turned.shape[:2], 3, 3), np.nan))
+        found[name] = _Turned(turned, unknown)
     return found
 
 
