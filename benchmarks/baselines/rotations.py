@@ -19,7 +19,7 @@ from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.timing.rate import FPS
 
-DENSITIES = tuple(10.0**power for power in range(-1, 4))
+DENSITIES = tuple(10.0**power for power in range(-1, 6))
 """Process densities that are searched, rad²/s³, over the noise's variance in units of 0.01 rad²."""
 
 _WIDTH, _SCALE, _BATCH, _FRAMES = 256, 5.0, 32, 60
@@ -104,7 +104,7 @@ def train_rotations(
     for _ in track(range(steps)):
         rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
         picked = rng.integers(clips, size=_BATCH)
-        spun = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, _BATCH)).as_matrix()
+        spun = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (_BATCH, 1))).as_matrix()
         seen = corrupt(np.einsum("bij,tbkj->tbki", spun, motion.positions[rows, picked]), rng)
         wanted = _batch_first(spun[:, None] @ truth[rows, picked])
         found = net(*_inputs(seen))

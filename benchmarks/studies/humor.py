@@ -36,7 +36,7 @@ from steadypose.benchmarks.studies.humor_fits import (
     scores,
     seen_joints,
     shipped,
-    start_of,
+    starts_of,
 )
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
@@ -223,7 +223,7 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bo
     }
     if not hide:
         answers = {_TRUTH: _each(truth), _RAW: _each(seen)} | answers
-    answers |= {f"steadypose live, delay {delay}": _each(found) for delay, found in live.items()}
+    answers |= {f"steadypose live, delay {delay}": _each(found.positions[-FRAMES:]) for delay, found in live.items()}
     names = (_PER_FRAME, *reversed([*VARIANTS]), SHIPS)
     for name in bench.progress.track(names, description="hidden" if hide else "noisy"):
         answers[name] = _fits(models, name, live[DELAY], seen)
@@ -231,17 +231,17 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bo
     return [{"method": name, **scores(found, truth, unseen, load)} for name, found in answers.items()]
 
 
-def _live(clips: MotionClips, seen: Floats, delay: int) -> Floats:
+def _live(clips: MotionClips, seen: Floats, delay: int) -> product.Cleaned:
     """Return `clean`'s live output for clips (T, C, 22, 3)."""
-    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay).positions[-FRAMES:]
+    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay)
 
 
-def _fits(models: dict[str, Any], name: str, start: Floats, seen: Floats) -> list[Answer]:
-    """Fit each of C clips with one model or without one; ``start`` and ``seen`` (T, C, 22, 3)."""
+def _fits(models: dict[str, Any], name: str, live: product.Cleaned, seen: Floats) -> list[Answer]:
+    """Fit each of C clips ``seen`` (T, C, 22, 3), metres, with one model or without one, starting from ``live``."""
     model, stages = (models[SHIPS], 2) if name == _PER_FRAME else (models[name], 3)
     return [
-        fitted(model, [start_of(start[:, c])], seen_joints(seen[:, c]), stages, FitSettings())
-        for c in range(seen.shape[1])
+        fitted(model, [start], seen_joints(seen[:, c]), stages, FitSettings())
+        for c, start in enumerate(starts_of(live, FRAMES))
     ]
 
 

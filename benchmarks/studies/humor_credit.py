@@ -33,13 +33,13 @@ from steadypose.benchmarks.studies.humor_fits import (
     scores,
     seen_joints,
     shipped,
-    start_of,
+    starts_of,
 )
 from steadypose.benchmarks.studies.humor_rollout import PHASES, fit_rolled_out
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.energy import Standing, Transitions
 from steadypose.prior.fit.humor_network import HumorNet
-from steadypose.prior.fit.solve import FitSettings
+from steadypose.prior.fit.solve import FitSettings, Start
 
 DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit")
 
@@ -59,7 +59,7 @@ _OFF = 1e6
 _NO_CVAE = FitSettings(transitions=Transitions(_OFF, _OFF, _OFF))
 VARIANTS: Mapping[str, FitSettings] = {
     AS_IT_SHIPS: FitSettings(),
-    "stage 3 always": FitSettings(unlikely=np.inf),
+    "stage 3 always": FitSettings(discrepancy=np.inf),
     "no CVAE": _NO_CVAE,
     "no CVAE, no contacts": replace(_NO_CVAE, standing=Standing(_OFF, _OFF)),
 }
@@ -90,9 +90,9 @@ def run(bench: Bench) -> Result:
     return Result(tables, {"data": clips.source, "records": records})
 
 
-def starts_of(clips: MotionClips, seen: Floats) -> Floats:
+def cleaned(clips: MotionClips, seen: Floats) -> product.Cleaned:
     """Return `clean`'s live output for clips (T, C, 22, 3), metres, from which fits start."""
-    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, DELAY).positions[-len(seen) :]
+    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, DELAY)
 
 
 def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, Any]]:
@@ -102,7 +102,8 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
     for condition, (noise, below) in CONDITIONS.items():
         seen, tuning = (corrupted(clips.positions, noise, below, seed) for seed in (0, 1))
         some = range(0, len(clips.offsets), 3)
-        starts, tuning_starts = starts_of(clips, seen), starts_of(clips, tuning)
+        live = cleaned(clips, seen)
+        starts, tuning_starts = (starts_of(each, len(seen)) for each in (live, cleaned(clips, tuning)))
         steps = FitSettings().pose_steps + FitSettings().motion_steps
         stage_2 = min(
             (replace(FitSettings(), smooth_sigma=smooth, pose_steps=steps) for smooth in SMOOTH),
@@ -113,7 +114,7 @@ def credit(bench: Bench, model: HumorNet, clips: MotionClips) -> list[dict[str, 
             name: errors(model, clips, starts, seen, settings, stages, range(len(clips.offsets)))
             for name, (settings, stages) in bench.progress.track(fits.items(), description=f"credit, {condition}")
         }
-        each = (starts.swapaxes(0, 1), clips.positions.swapaxes(0, 1), seen.swapaxes(0, 1))
+        each = (values.swapaxes(0, 1) for values in (live.positions[-len(seen) :], clips.positions, seen))
         found[CLEANED] = np.array([_error(*one) for one in zip(*each, strict=True)])
         for name, each in found.items():
             records.append({
@@ -136,13 +137,13 @@ def _paired(each: Floats, other: Floats, person: Any) -> dict[str, Any]:
 
 
 def errors(
-    model: HumorNet, clips: MotionClips, starts: Floats, seen: Floats, settings: FitSettings, stages: int,
+    model: HumorNet, clips: MotionClips, starts: Sequence[Start], seen: Floats, settings: FitSettings, stages: int,
     which: Iterable[int],
 ) -> Floats:  # fmt: skip
     """Return the errors of each clip, metres: of the hidden joints if there are any, otherwise of all."""
     found = []
     for c in which:
-        answer = fitted(model, [start_of(starts[:, c])], seen_joints(seen[:, c]), stages, settings)
+        answer = fitted(model, [starts[c]], seen_joints(seen[:, c]), stages, settings)
         found.append(_error(answer.joints, clips.positions[:, c], seen[:, c]))
     return np.array(found)
 
@@ -160,7 +161,7 @@ def terms(bench: Bench, model: HumorNet, clips: MotionClips, which: Sequence[int
     records: list[dict[str, Any]] = []
     full = np.zeros(len(taken))
     for name, changed in bench.progress.track(TERMS.items(), description="terms"):
-        settings = replace(camera_settings(), unlikely=np.inf, **changed)
+        settings = replace(camera_settings(), discrepancy=np.inf, **changed)
         answers = [fitted(model, one.flat.starts, one.flat.observed, 3, settings) for one in taken]
         each = np.array([position_error(a.joints, one.truth).mean() for a, one in zip(answers, taken, strict=True)])
         full = each if name == FULL else full
@@ -173,8 +174,9 @@ def rolled(
     model: HumorNet, clips: MotionClips, which: Sequence[int], phases: Sequence[tuple[int, bool]]
 ) -> list[dict[str, Any]]:
     """Fit noisy joints by stage 3 with all poses as variables, and with the first state and latents."""
-    seen, settings = corrupted(clips.positions, NOISE, 0.0, 0), FitSettings(unlikely=np.inf)
-    starts = [start_of(start) for start in starts_of(clips, seen)[:, which].swapaxes(0, 1)]
+    seen, settings = corrupted(clips.positions, NOISE, 0.0, 0), FitSettings(discrepancy=np.inf)
+    every = starts_of(cleaned(clips, seen), len(seen))
+    starts = [every[c] for c in which]
     observed = [seen_joints(seen[:, c]) for c in which]
     fits = [fitted(model, [start], one, 3, settings) for start, one in zip(starts, observed, strict=True)]
     began = time.process_time()

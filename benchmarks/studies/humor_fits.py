@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,14 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from steadypose.benchmarks import product
 from steadypose.benchmarks.depth_camera import Stereo, corrupt, render
 from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.nodes.driving import clean_joints
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.bone_lengths import estimate_offsets
-from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts
+from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts, rotation_matrices
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.bodies import noise_of
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
@@ -63,11 +62,16 @@ class Answer:
     seconds: float | None = None
 
 
-def start_of(positions: Floats) -> Start:
-    """Return where ``steadypose fit`` starts for joints in space, from `clean`'s output (T, 22, 3); the floor is
-    known."""
-    offsets = estimate_offsets(positions)
-    return Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, ground_known=True)
+def starts_of(cleaned: product.Cleaned, frames: int, ground: Callable[[Floats], float] | None = None) -> list[Start]:
+    """Return where ``steadypose fit`` starts for each clip of `clean`'s output, of which the last ``frames`` count; the
+    floor is at 0, or ``ground`` guesses its height from joints (T, 22, 3)."""
+    turned = cleaned.rotations[-frames:] / np.linalg.norm(cleaned.rotations[-frames:], axis=-1, keepdims=True)
+    return [
+        Start.of_joints(
+            joints, ground(joints) if ground else 0.0, rotations=rotation_matrices(q), ground_known=ground is None
+        )
+        for joints, q in zip(cleaned.positions[-frames:].swapaxes(0, 1), turned.swapaxes(0, 1), strict=True)
+    ]
 
 
 def seen_joints(seen: Floats) -> list[Observed]:

@@ -37,7 +37,7 @@ from steadypose.benchmarks.intervals import Interval, ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import ROOT, VARIANTS
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped
+from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped, starts_of
 from steadypose.benchmarks.studies.kinect_clips import side_by_side
 from steadypose.benchmarks.studies.rotations_truth import (
     SCORED,
@@ -66,7 +66,7 @@ from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import OrientSettings, PriorSettings, RefineSettings
 from steadypose.prior.fit.bodies import lowest_floor
-from steadypose.prior.fit.solve import FitSettings, Start
+from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.fit.windows import Track, fit_track
 from steadypose.prior.models.posture import RootCovariance, trunk_frame
 from steadypose.prior.timing.rate import FPS
@@ -282,12 +282,10 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline], net: RotationNet, dens
 
 def _fitted(seen: Floats) -> Floats:
     """Return the orientations (T, C, 17, 3, 3) of fits of joints (T, C, 22, 3)."""
-    cleaned = product.run(PriorSettings(), seen, np.arange(len(seen)) / FPS, FIT_DELAY).positions[-len(seen) :]
+    cleaned = product.run(PriorSettings(), seen, np.arange(len(seen)) / FPS, FIT_DELAY)
     model, found = shipped(), []
-    for joints, start in zip(seen.swapaxes(0, 1), cleaned.swapaxes(0, 1), strict=True):
-        offsets = estimate_offsets(start)
-        begin = Start.of(start[:, 0], solve_rotations(start, offsets), offsets, lowest_floor(start))
-        fitted = fit_track(model, Track([begin], seen_joints(joints)), FitSettings())
+    for joints, start in zip(seen.swapaxes(0, 1), starts_of(cleaned, len(seen), lowest_floor), strict=True):
+        fitted = fit_track(model, Track([start], seen_joints(joints)), FitSettings())
         found.append(global_rotations(fitted.rotations)[:, list(SCORED)])
     return np.stack(found, axis=1)
 

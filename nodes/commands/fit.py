@@ -121,7 +121,8 @@ def _line(fit: Fit) -> str:
         return f"{who}: not explained, left as `clean` has it and flagged"
     known = fit.misfit[np.isfinite(fit.misfit)]
     far = f"; joints seen lie {np.median(known) * 1e3:.0f} mm off in the median" if len(known) else ""
-    return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}"
+    kept = f"; the motion model explains {fit.track.kept.sum()} of {len(fit.track.kept)} windows"
+    return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}{kept}"
 
 
 def _fit_picture(

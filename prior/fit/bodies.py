@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Message, PoseClean, PoseRaw, PoseWorld, WorldBody
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.bone_lengths import estimate_offsets
-from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import REST_HEIGHT, SensorFrame, quaternions
+from steadypose.prior.body.kinematics import REST_HEIGHT, SensorFrame, quaternions, rotation_matrices
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import float_tensor
@@ -73,6 +71,15 @@ class Seen:
             for message, body in zip(self.clean, self.bodies, strict=True)
         ])  # fmt: skip
 
+    @property
+    def rotations(self) -> Floats:
+        """(T, 22, 3, 3) local; the root's to the world."""
+        published = np.stack([body.rotations for body in self.bodies]).astype(np.float64)
+        turned = rotation_matrices(published / np.linalg.norm(published, axis=-1, keepdims=True))
+        sensor = np.stack([SensorFrame.of(message.sensor_pose).rotation for message in self.clean])
+        turned[:, 0] = sensor @ turned[:, 0]
+        return turned
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -116,10 +123,8 @@ def track_of(seen: Seen, points: Floats | None) -> Track:
         points: (T, N, 3) metres, world, points of its surface, padded with NaN; None if there are none.
     """
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
-    offsets = estimate_offsets(positions)
     floor = 0.0 if seen.calibrated else lowest_floor(positions)
-    rotations = solve_rotations(positions, offsets)
-    start = Start.of(positions[:, 0], rotations, offsets, floor, ground_known=seen.calibrated)
+    start = Start.of_joints(positions, floor, rotations=seen.rotations, ground_known=seen.calibrated)
     noise = noise_of(raw)
     raw = np.where(np.linalg.norm(raw - positions, axis=-1, keepdims=True) > FAR + 5.0 * noise, np.nan, raw)
     confidence = np.clip(np.stack([body.raw_confidence for body in seen.bodies]), 0.05, 1.0)
@@ -275,7 +280,8 @@ def _fitted_world(fit: Fit, row: int, body: WorldBody) -> WorldBody:
     around = slice(max(row - 1, 0), row + 2)
     velocity = np.gradient(joints[around, 0], 1e-9 * FRAME_NS, axis=0)[min(row, 1)]
     turned = quaternions(track.rotations[row])
-    load = body.contacts if np.isnan(track.load[row]).any() else track.load[row]
+    # a foot whose contacts `pose/world` does not know is only guessed in a fit too
+    load = np.where(np.isnan(track.load[row]) | np.isnan(body.contacts), body.contacts, track.load[row])
     return replace(
         body, root_position=joints[row, 0], root_orientation=turned[0], root_velocity=velocity, positions=joints[row],
         rotations=turned, contacts=load,

@@ -50,10 +50,6 @@ class State:
         """Select bodies by indices of the leading dimensions."""
         return State(*(getattr(self, field.name)[at] for field in fields(self)))
 
-    def detach(self) -> State:
-        """Return the states without gradients."""
-        return State(*(getattr(self, field.name).detach() for field in fields(self)))
-
 
 def stack(states: list[State], dim: int) -> State:
     """Stack states of several times along a new dimension."""

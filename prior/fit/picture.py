@@ -20,7 +20,6 @@ from scipy.ndimage import gaussian_filter1d, median_filter, percentile_filter
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.capsules import CAPSULES
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, quaternions, yaw_matrix
@@ -254,8 +253,7 @@ def _start_of_joints(cleaned: Floats, floor: float) -> list[Start]:
         return []
     nearest = known[np.abs(np.arange(len(cleaned))[:, None] - known).argmin(axis=1)]
     positions = cleaned[nearest]
-    offsets = estimate_offsets(positions)
-    return [Start.of(positions[:, 0], solve_rotations(positions, offsets), offsets, floor)]
+    return [Start.of_joints(positions, floor)]
 
 
 def track_of_key_points(recording: KeyPointRecording, clean: Clean) -> Track:

@@ -17,6 +17,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.fit.energy import Anchored, Bones, FirstState, Ground, Smooth, Standing, Term, Transitions, energy
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import SCALES, Motion, Variables, float_tensor
@@ -37,7 +39,7 @@ TOLERANCE = 1e-4
 WINDOW = 7
 """Number of frames of which a joint's initial acceleration is the median."""
 
-UNLIKELY, NEGLIGIBLE = 1.08, 0.1
+DISCREPANCY, NEGLIGIBLE = 1.08, 0.1
 """Stage 3 is kept if the energy of the observations is at most this many times that of stage 2, or at most this share
 of the energy expected of their noise. Chosen on validation people (benchmarks/NOTEBOOK.md)."""
 
@@ -49,14 +51,14 @@ class FitSettings:
     Attributes:
         root_steps, pose_steps, motion_steps: numbers of L-BFGS steps, with up to five evaluations each.
         smooth_sigma: m/s², of `Smooth` in stages 1 and 2.
-        agility: ratio of the standard deviation of a joint's accelerations to its initial ones nearby, added to
-            ``smooth_sigma`` in squares; 0 if the initial poses shake.
+        acceleration_share: ratio of the standard deviation of a joint's accelerations to its initial ones nearby, added
+            to ``smooth_sigma`` in squares; 0 if the initial poses shake.
         pose_sigma: of `FirstState` as a prior of all states in stage 2.
         transitions: the transition term of stage 3.
         first_sigma: of `FirstState` as a prior of all states in stage 3.
         motion_smooth_sigma: m/s², of `Smooth` in stage 3, against jitter that the motion model allows.
         standing: the contact term of stage 3.
-        unlikely: as `UNLIKELY`; infinite to keep stage 3 always.
+        discrepancy: as `DISCREPANCY`; infinite to keep stage 3 always.
         bones_sigma: metres, of `Bones`.
         ground_height_sigma: metres, of `Ground` if the ground is unknown.
         ground_tilt_sigma: radians, of `Ground` if the ground is unknown.
@@ -66,19 +68,19 @@ class FitSettings:
     pose_steps: int = 100
     motion_steps: int = 100
     smooth_sigma: float = 4.0
-    agility: float = 2.0
+    acceleration_share: float = 2.0
     pose_sigma: float = 12.0
     transitions: Transitions = field(default_factory=Transitions)
     first_sigma: float = 6.0
     motion_smooth_sigma: float = 8.0
     standing: Standing = field(default_factory=Standing)
-    unlikely: float = UNLIKELY
+    discrepancy: float = DISCREPANCY
     bones_sigma: float = 0.01
     ground_height_sigma: float = 0.05
     ground_tilt_sigma: float = 0.03
 
 
-PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, agility=0.0, pose_sigma=4.0)
+PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, acceleration_share=0.0, pose_sigma=4.0)
 """Settings for key points of an image, which determine size less well and start farther from the solution."""
 
 
@@ -106,6 +108,15 @@ class Start:
     ) -> Start:
         """Build the start from arrays of the same shapes."""
         return cls(float_tensor(root), float_tensor(rotations), float_tensor(offsets), ground, ground_known)
+
+    @classmethod
+    def of_joints(
+        cls, positions: Floats, ground: float = 0.0, *, rotations: Floats | None = None, ground_known: bool = False
+    ) -> Start:
+        """Build the start from joints (T, 22, 3) metres, and local rotations (T, 22, 3, 3), by default aimed bones."""
+        offsets = estimate_offsets(positions)
+        turned = solve_rotations(positions, offsets) if rotations is None else rotations
+        return cls.of(positions[:, 0], turned, offsets, ground, ground_known=ground_known)
 
 
 @dataclass(frozen=True)
@@ -158,14 +169,14 @@ def fit_window(
         advanced()
     with torch.no_grad():
         motion, earlier = Motion(model, variables), Motion(model, before)
-        kept = "latents" not in chosen[-1].free or _explains(motion, earlier, observed, settings.unlikely)
+        kept = "latents" not in chosen[-1].free or _explains(motion, earlier, observed, settings.discrepancy)
         return Fitted(motion if kept else earlier, tuple(found), kept)
 
 
-def _explains(motion: Motion, before: Motion, observed: Sequence[Term], unlikely: float) -> bool:
+def _explains(motion: Motion, before: Motion, observed: Sequence[Term], discrepancy: float) -> bool:
     """Whether ``motion`` explains the observations nearly as well as ``before`` it."""
     noise = sum(0.5 * term.residual(motion).numel() for term in observed)
-    return float(energy(motion, observed)) <= max(unlikely * float(energy(before, observed)), NEGLIGIBLE * noise)
+    return float(energy(motion, observed)) <= max(discrepancy * float(energy(before, observed)), NEGLIGIBLE * noise)
 
 
 class _Stage(NamedTuple):
@@ -183,7 +194,8 @@ def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[
     if not start.ground_known:
         shape.append(Ground(start.ground, settings.ground_height_sigma, settings.ground_tilt_sigma))
         body = (*body, "ground")
-    smooth = Smooth(torch.hypot(torch.tensor(settings.smooth_sigma), settings.agility * _accelerations(start)))
+    moving = settings.acceleration_share * _accelerations(start)
+    smooth = Smooth(torch.hypot(torch.tensor(settings.smooth_sigma), moving))
     poses = [*given, *shape, smooth, FirstState(settings.pose_sigma, all_states=True)]
     motion = [
         *given, *shape, settings.transitions, FirstState(settings.first_sigma, all_states=True), settings.standing,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -60,6 +61,7 @@ class FittedTrack:
         load: (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them.
         misfit: (K, T, 22) `Observed.misfit` of each of K observations.
         energies: (W, S) nats after each stage.
+        kept: (W,) whether a window's last stage was kept.
     """
 
     joints: Floats
@@ -69,6 +71,7 @@ class FittedTrack:
     load: Floats
     misfit: Floats
     energies: Floats
+    kept: NDArray[np.bool_]
 
 
 def window_bounds(frames: int) -> list[tuple[int, int]]:
@@ -144,6 +147,7 @@ def _arrays(fitted: Fitted, seen: Sequence[Observed]) -> dict[str, Floats]:
         "load": load_of(motion),
         "misfit": np.stack([_numpy(observed.misfit(motion)) for observed in seen]),
         "energies": np.array(fitted.energies),
+        "kept": np.array(fitted.kept),
     }
 
 
@@ -175,7 +179,7 @@ def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]
         a, b = whole["rotations"], found["rotations"]
         mixed = _slerp(a[-shared:], b[:shared], share)
         whole["rotations"] = np.concatenate([a[:-shared], mixed, b[shared:]])
-    every = {name: np.stack([found[name] for found in done]) for name in ("offsets", "ground", "energies")}
+    every = {name: np.stack([found[name] for found in done]) for name in ("offsets", "ground", "energies", "kept")}
     return FittedTrack(**whole, **every)
 
 

@@ -18,7 +18,7 @@ from steadypose.benchmarks.studies.humor import MVAE, SHIPS, VARIANTS
 from steadypose.benchmarks.studies.humor_fits import Answer, load_labels, pictures, scores
 from steadypose.prior.fit.humor_network import roll_out
 from steadypose.prior.fit.observations import KeyPoints, SurfacePoints
-from steadypose.prior.fit.solve import FitSettings
+from steadypose.prior.fit.solve import FitSettings, Start
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +109,11 @@ def test_what_a_fit_owes_to_the_model_is_paired_by_clip(tmp_path: Path, monkeypa
 def test_what_is_rolled_out_follows_from_the_first_state_and_comes_nearer(clips: MotionClips) -> None:
     model, settings = fits.shipped(), FitSettings(root_steps=10, pose_steps=20)
     seen = fits.corrupted(clips.positions[:12], 0.02, 0.0, 0)
-    given = [fits.start_of(seen[:, c]) for c in range(2)], [fits.seen_joints(seen[:, c]) for c in range(2)]
-    far, near = (humor_rollout.fit_rolled_out(model, *given, settings, phases) for phases in ([(0, True)], [(1, True)]))
+    starts = [Start.of_joints(seen[:, c], ground_known=True) for c in range(2)]
+    observed = [fits.seen_joints(seen[:, c]) for c in range(2)]
+    far, near = (
+        humor_rollout.fit_rolled_out(model, starts, observed, settings, phases) for phases in ([(0, True)], [(1, True)])
+    )
     for motion in (*far, *near):
         assert isinstance(motion.latents, torch.Tensor)
         rolled = roll_out(model, motion.states[0], motion.latents, motion.offsets)

@@ -113,6 +113,9 @@ def test_a_track_starts_from_clean_in_the_world_and_is_to_meet_what_was_seen(cal
     track = track_of(seen, points)
     (start,) = track.starts
     np.testing.assert_allclose(start.root.numpy(), motion[:, 0], atol=1e-5)
+    published = Rotation.from_quat(seen.bodies[0].rotations).as_matrix()
+    published[0] = Rotation.from_quat(SENSOR.orientation).as_matrix() @ published[0]
+    np.testing.assert_allclose(start.rotations[0].numpy(), published, atol=1e-5)
     assert start.ground_known == calibrated
     assert start.ground == pytest.approx(0.0 if calibrated else 0.2, abs=1e-5)
     joints, surface = track.observed
@@ -169,6 +172,7 @@ def track(joints: np.ndarray, load: float = 0.5) -> FittedTrack:
         np.full((len(joints), 8), load),
         np.zeros((1, len(joints), 22)),
         np.zeros((2, 3)),
+        np.array([True, False]),
     )
 
 
@@ -230,7 +234,8 @@ def test_each_body_of_a_stream_is_fitted_to_the_points_of_its_own_frames(
 def test_fitted_poses_are_in_the_messages_of_their_body_and_time(load: float) -> None:
     told: list[tuple[str, Message]] = [*messages(still())]
     for t in range(12):
-        body = world_body(still()[t], id=7, root_position=np.zeros(3), contacts=np.full(8, 0.25))
+        known = np.where(np.arange(8) == 2, np.nan, 0.25)
+        body = world_body(still()[t], id=7, root_position=np.zeros(3), contacts=known)
         bodies, floor = [body, replace(body, id=8)], np.array([0.0, 0.0, 1.0, 0.0])
         told.append((POSE_WORLD, PoseWorld(START_NS + round(t * FRAME_NS), "world", "test", floor, bodies)))
     (seen,) = bodies_seen(told, 8)
@@ -254,7 +259,8 @@ def test_fitted_poses_are_in_the_messages_of_their_body_and_time(load: float) ->
         np.testing.assert_allclose(body.root_position, joints[row, 0], atol=1e-6)
         np.testing.assert_allclose(body.root_velocity, velocity[row], atol=1e-6)
         np.testing.assert_allclose(body.root_orientation, body.rotations[0], atol=1e-6)
-        np.testing.assert_allclose(body.contacts, 0.25 if np.isnan(load) else load)
+        assert np.isnan(body.contacts[2]), "a foot that nobody sees"
+        np.testing.assert_allclose(np.delete(body.contacts, 2), 0.25 if np.isnan(load) else load)
         np.testing.assert_allclose(message.ground_plane, ground_plane(np.array([0.2, 0.0, 0.03])), atol=1e-6)
         assert (other.id, other.root_position.any()) == (8, False)
 

@@ -10,11 +10,11 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
-from steadypose.benchmarks.studies.humor_fits import fitted, pictures, seen_joints, start_of
+from steadypose.benchmarks.studies.humor_fits import fitted, pictures, seen_joints
 from steadypose.prior.body.skeleton import limbs
 from steadypose.prior.fit import windows
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
-from steadypose.prior.fit.solve import STIFFNESS, FitSettings, preconditioner
+from steadypose.prior.fit.solve import STIFFNESS, FitSettings, Start, preconditioner
 from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.fit.windows import Track, fit_track, window_bounds
 
@@ -44,7 +44,7 @@ def error(said: np.ndarray, truth: np.ndarray) -> float:
 def test_a_simulated_motion_is_found_under_noise(model: HumorNet, truth: np.ndarray) -> None:
     seen = truth + NOISE * np.random.default_rng(0).standard_normal(truth.shape)
     smooth = gaussian_filter1d(seen, 3.0, axis=0, mode="nearest")
-    found = fitted(model, [start_of(smooth)], seen_joints(seen), 3, BRIEF)
+    found = fitted(model, [Start.of_joints(smooth, ground_known=True)], seen_joints(seen), 3, BRIEF)
     assert error(found.joints, truth) < 0.5 * error(seen, truth)
     assert error(found.joints, truth) < 0.9 * error(smooth, truth)
     assert found.load is not None
@@ -58,7 +58,7 @@ def test_legs_that_are_hidden_for_a_while_go_on(model: HumorNet, truth: np.ndarr
     seen, start = truth.copy(), truth.copy()
     seen[15:30, leg] = np.nan
     start[15:30, leg] = start[14, leg]  # as a sensor that holds what it lost
-    found = fitted(model, [start_of(start)], seen_joints(seen), 3, BRIEF)
+    found = fitted(model, [Start.of_joints(start, ground_known=True)], seen_joints(seen), 3, BRIEF)
     assert error(found.joints[15:30, leg], truth[15:30, leg]) < 0.7 * error(start[15:30, leg], truth[15:30, leg])
 
 
@@ -75,7 +75,7 @@ def test_a_long_track_is_one_motion_and_done_windows_are_not_done_again(
     monkeypatch.setattr(windows, "FRAMES", 20)
     monkeypatch.setattr(windows, "OVERLAP", 5)
     seen = truth[:35] + 0.01 * np.random.default_rng(0).standard_normal(truth[:35].shape)
-    track = Track([start_of(seen)], seen_joints(seen))
+    track = Track([Start.of_joints(seen, ground_known=True)], seen_joints(seen))
     calls: list[int] = []
     whole = windows.fit_window
 

@@ -196,7 +196,9 @@ def test_what_is_written_is_in_the_cameras_frame() -> None:
     load = np.random.default_rng(0).uniform(size=(FRAMES, 8))
     none = np.zeros((1, 3))
     kept = rotations.copy()
-    found = arrays_of_fit(told, FittedTrack(moving, rotations, REST_OFFSETS[None], none, load, none, none))
+    found = arrays_of_fit(
+        told, FittedTrack(moving, rotations, REST_OFFSETS[None], none, load, none, none, np.array([True]))
+    )
     np.testing.assert_array_equal(rotations, kept)
     placed = place_joints(rotation_matrices(found["rotations"].astype(float)), REST_OFFSETS)
     np.testing.assert_allclose(placed + found["positions"][:, :1], found["positions"], atol=1e-5)

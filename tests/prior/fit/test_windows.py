@@ -19,7 +19,7 @@ from steadypose.prior.fit.energy import Smooth, energy
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.motion import Motion, Variables
 from steadypose.prior.fit.observations import SeenJoints
-from steadypose.prior.fit.solve import UNLIKELY, FitSettings, Start, _explains, _stages, fit_window
+from steadypose.prior.fit.solve import DISCREPANCY, FitSettings, Start, _explains, _stages, fit_window
 from steadypose.prior.fit.windows import _fingerprint, _grounded, _joined, load_of, window_bounds
 
 
@@ -28,7 +28,7 @@ def window(value: float, turned: float, frames: int = 6) -> dict[str, Any]:
     return {
         "joints": np.full((frames, 22, 3), value), "rotations": rotations, "load": np.full((frames, 8), value),
         "misfit": np.full((2, frames, 22), value), "offsets": np.full((22, 3), value), "ground": np.full(3, value),
-        "energies": np.full(3, value),
+        "energies": np.full(3, value), "kept": np.array(value > 0.5),
     }  # fmt: skip
 
 
@@ -41,6 +41,7 @@ def test_windows_are_faded_over_where_they_overlap() -> None:
     np.testing.assert_allclose(turns, np.outer(line, [0.0, 0.0, 1.0]), atol=1e-12)
     for values in (found.offsets[:, 3, 1], found.ground[:, 2], found.energies[:, 0]):
         assert values.tolist() == [0.0, 1.0, 2.0]
+    assert found.kept.tolist() == [False, True, True]
 
 
 def test_windows_follow_each_other_every_two_and_a_half_seconds() -> None:
@@ -107,7 +108,7 @@ def test_each_stage_lowers_the_energy_of_its_terms_and_says_so() -> None:
     positions = waving(6) + 0.01 * np.random.default_rng(0).standard_normal((6, 22, 3))
     start = Start.of(positions[:, 0] + 0.05, np.tile(np.eye(3), (6, 22, 1, 1)), REST_OFFSETS)
     seen = SeenJoints(torch.from_numpy(positions).float(), torch.full((6, 22), 0.02))
-    brief = FitSettings(root_steps=20, pose_steps=20, motion_steps=20, agility=0.0, unlikely=torch.inf)
+    brief = FitSettings(root_steps=20, pose_steps=20, motion_steps=20, acceleration_share=0.0, discrepancy=torch.inf)
     told: list[int] = []
     found = fit_window(model, start, [seen], brief, advanced=lambda: told.append(1))
     assert len(found.energies) == len(told) == 3
@@ -151,7 +152,7 @@ def test_the_last_stage_may_explain_a_little_less_or_anything_far_below_the_nois
         return cast(Motion, torch.full((200,), (nats / 100.0) ** 0.5))  # 200 residuals; 100 nats are their noise's
 
     term = cast(Any, SimpleNamespace(residual=lambda values: values, kernel=lambda square: square))
-    assert _explains(of(after), of(before), [term], UNLIKELY) == kept
+    assert _explains(of(after), of(before), [term], DISCREPANCY) == kept
 
 
 def test_smoothness_yields_to_what_a_joint_does_and_not_to_a_jump() -> None:
@@ -159,7 +160,7 @@ def test_smoothness_yields_to_what_a_joint_does_and_not_to_a_jump() -> None:
     root[:, 0] = 0.5 * 6.0 * (torch.arange(30) / 30.0) ** 2
     root[20:, 1] += 0.3
     start = Start(root, torch.eye(3).repeat(30, 22, 1, 1), torch.zeros(22, 3))
-    (smooth,) = _stages(start, [], FitSettings(smooth_sigma=4.0, agility=2.0))[0].terms
+    (smooth,) = _stages(start, [], FitSettings(smooth_sigma=4.0, acceleration_share=2.0))[0].terms
     assert isinstance(smooth, Smooth)
     assert isinstance(smooth.sigma, torch.Tensor)
     expected = torch.full((28, 22), (4.0**2 + 2.0**2 * 6.0**2 / 3.0) ** 0.5)
