@@ -37,7 +37,7 @@ def test_a_lag_and_stiffness_average_noise_away() -> None:
 
 
 def test_without_lag_an_agile_filter_gives_back_what_it_sees() -> None:
-    seen = Rotation.random(20, random_state=0).as_matrix()[:, None]
+    seen = Rotation.from_rotvec(np.random.default_rng(0).standard_normal((20, 3))).as_matrix()[:, None]
     np.testing.assert_allclose(smooth_rotations(seen, 1e9, 0), seen, atol=1e-3)
 
 
