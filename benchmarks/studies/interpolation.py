@@ -23,12 +23,20 @@ from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
-from steadypose.prior.body.kinematics import CONTACT_JOINTS, global_rotations, heading, quaternions, yaw_matrix
+from steadypose.prior.body.kinematics import (
+    CONTACT_JOINTS,
+    global_rotations,
+    heading,
+    quaternions,
+    rotation_matrices,
+    yaw_matrix,
+)
 from steadypose.prior.body.skeleton import JOINTS
 from steadypose.prior.complete.body import Fill
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.completer_features import solved_rotations
 from steadypose.training.data.dataset import MotionSet
 
 DEPENDS_ON = (COMPLETE, "completer weights", "hmvae64 weights", "prior.fit.optimise")
@@ -38,6 +46,9 @@ BEFORE, AFTER = 10, 1
 SEARCHED = 8
 """Number of clips on which HM-VAE is searched, which takes seconds for each."""
 FRAMES = BEFORE + max(GAPS) + AFTER
+
+JOINTS_GIVEN = "cubic spline, joints given"
+"""Row of the spline through rotations solved from joints, which are all that the completer is given."""
 
 _FEET = [k for k, joint in enumerate(CONTACT_JOINTS) if JOINTS[joint].endswith(("ankle", "foot"))]
 _FOOT_JOINTS = [CONTACT_JOINTS[k] for k in _FEET]
@@ -93,6 +104,8 @@ def run(bench: Bench) -> Result:
         "slerp and lerp": inbetween.slerp_and_lerp,
         "cubic spline": inbetween.cubic_spline,
         "nearest training window": inbetween.NearestWindow(train),
+        "slerp and lerp, joints given": from_joints(inbetween.slerp_and_lerp, completer),
+        JOINTS_GIVEN: from_joints(inbetween.cubic_spline, completer),
         "completer": lambda positions, rotations, offsets: completer(positions, offsets),
     }
     records: list[dict[str, Any]] = []
@@ -114,6 +127,17 @@ def run(bench: Bench) -> Result:
         ],
         {"data": source, "records": records, "searches": searches},
     )
+
+
+def from_joints(method: inbetween.InBetween, completer: LiveCompleter) -> inbetween.InBetween:
+    """Return the method on rotations solved from the joints, as the completer solves them."""
+    usual = rotation_matrices(completer.usual)
+
+    def fill(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
+        solved = solved_rotations(positions, np.broadcast_to(offsets[:, None], positions.shape), usual)[0]
+        return method(positions, solved, offsets)
+
+    return fill
 
 
 def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
@@ -229,9 +253,10 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
         columns=["method", "gap, frames", *(text for text, _ in columns.values())],
         rows=[[r["method"], str(r["gap"]), *(cell(r) for _, cell in columns.values())] for r in rows],
         note=(
-            f"{clips} clips, spread evenly over the sources. On LAFAN1, which is other motion on another skeleton, the "
-            "two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56 and 0.70 of slerp's L2Q at 5, 15, 30 and 45 "
-            "frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's."
+            f"{clips} clips, spread evenly over the sources. Baselines have the rotations of the file; where joints are "
+            "given, rotations solved from them, as the completer. On LAFAN1, which is other motion on another skeleton, "
+            "the two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56 and 0.70 of slerp's L2Q at 5, 15, 30 and "
+            "45 frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's."
         ),
     )
 

@@ -2,9 +2,9 @@
 
 The estimate is the sum of three parts. The *line* interpolates each joint between its known frames, rotations by slerp
 and the root by lerp. A joint that is known on one side only is held; a joint that is never known has the mean pose. The
-*bend* is a cubic with the velocities at both ends, minus the line; the network outputs a gate for it. The *correction*
-is the rest of the network's output, minus the line through its values at known frames (`anchored`). It vanishes at
-known frames, so there is no step.
+*bend* is the natural cubic spline through the known frames, minus the line; the network outputs a gate for it. The
+*correction* is the rest of the network's output, minus the line through its values at known frames (`anchored`). It
+vanishes at known frames, so there is no step. In short gaps little is taken from the network (`correction_share`).
 """
 
 from __future__ import annotations
@@ -40,11 +40,13 @@ of the gates of each joint's and the root's bend."""
 NEAR = 8.0
 """Distance from a known frame at which the nearness 1 / (1 + d / NEAR) is one half, frames."""
 
-SHORT_SHARE, LONG_SHARE, LONG_GAP = 0.2, 0.75, 30.0
-"""Shares of the correction that are applied in gaps of 0 frames, and of at least `LONG_GAP` frames."""
+SHARE_FRAMES = 75.0
+"""Length of a gap, frames, at which the whole correction is applied; in shorter gaps, a share proportional to their
+length. Among curves compared on validation people, by source, it is the simplest that is at no gap much worse than the
+cubic or the line (benchmarks/NOTEBOOK.md)."""
 
 MAX_BEND = 2.0
-"""Bound of a bend's entries: entries of rotation matrices, and metres."""
+"""Bound of the root's bend along an axis, metres."""
 
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]
@@ -103,7 +105,7 @@ class Window(NamedTuple):
         features: (B, T, FEATURES) float32.
         rotations: (B, T, 22, 3, 3) local rotations of the line.
         root: (B, T, 3) metres, root positions of the line.
-        bend: (B, T, 23, 6) cubics minus the line: of the rotations' first two columns and, last, of the root (three
+        bend: (B, T, 23, 6) cubics minus the line: first two columns of the rotations and, last, the root (three
             values in metres and three zeros).
         line: the interpolation.
         turn: (B, 3, 3) rotations from the window's frame to the world.
@@ -172,16 +174,21 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
     origin = np.nan_to_num(positions[rows, somewhere, which])
     turned = np.where(rotations_known[..., None, None], rotations, np.eye(3))
     turned[:, :, 0] = turn.swapaxes(1, 2)[:, None] @ turned[:, :, 0]
-    filled = np.empty((count, frames, 22, 4))
-    _slerp(quaternions(turned), line.before, line.after, line.weight, line.ever, usual, filled)
-    matrices = rotation_matrices(filled)
+    given = np.zeros((count, frames, 23, 4))
+    given[:, :, :22] = quaternions(turned)
     moved = np.nan_to_num((positions - origin[:, None, None]) @ turn[:, None])
+    given[:, :, 22, :3] = moved[:, :, 0]
+    curve = np.zeros(given.shape)
+    _slerp(given[:, :, :22], line.before, line.after, line.weight, line.ever, usual, curve[:, :, :22])
+    matrices = rotation_matrices(curve[:, :, :22])
     path = _lerp(moved[:, :, :1], line, slice(22, 23))[:, :, 0]
-    values = np.zeros((count, frames, 23, 6))
-    values[:, :, :22] = turned[..., :2].swapaxes(-1, -2).reshape(count, frames, 22, 6)
-    values[:, :, 22, :3] = moved[:, :, 0]
-    bend = np.zeros(values.shape, dtype=np.float32)
-    _bends(values, line.known, line.before, line.after, line.weight, bend)
+    curve[:, :, 22, :3] = path
+    _splines(given, line.known, curve)
+    bend = np.zeros((count, frames, 23, 6), dtype=np.float32)
+    curve[:, :, :22] /= np.linalg.norm(curve[:, :, :22], axis=-1, keepdims=True)
+    bent = rotation_matrices(curve[:, :, :22]) - matrices
+    bend[:, :, :22] = bent[..., :2].swapaxes(-1, -2).reshape(count, frames, 22, 6)
+    bend[:, :, 22, :3] = np.clip(curve[:, :, 22, :3] - path, -MAX_BEND, MAX_BEND)
     placed = np.where(known[..., None], moved - path[:, :, None], place_joints(matrices, bones))
     features = np.empty((count, frames, FEATURES), dtype=np.float32)
     _write(matrices, placed, path, known, features)
@@ -201,11 +208,10 @@ def draw_line(known: Bools) -> Line:
 def correction_share(line: Line) -> Floats32:
     """(B, T, 23, 1) share of the correction that is applied in addition to the cubic.
 
-    It is smaller in shorter gaps (chosen on validation), and 1 if a track is known on one side only or never.
+    It is `SHARE_FRAMES`' share, and 1 if a track is known on one side only or never.
     """
-    length = (line.after - line.before)[..., None].astype(np.float32)
-    between = SHORT_SHARE + (LONG_SHARE - SHORT_SHARE) * np.minimum(length / LONG_GAP, 1.0)
-    return np.where(length > 0, between, 1.0).astype(np.float32)
+    length = (line.after - line.before)[..., None]
+    return np.where(length > 0, np.minimum(length / SHARE_FRAMES, 1.0), 1.0).astype(np.float32)
 
 
 def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
@@ -257,39 +263,43 @@ def _neighbours(known, before, after, weight):
 
 
 @njit(cache=True)
-def _bends(values, known, before, after, weight, out):
-    """Write the Hermite cubic minus the line. At an end without a known velocity, the cubic is straight."""
+def _splines(values, known, out):
+    """Write the natural cubic spline through a track's known frames between them, if there are more than two.
+
+    All tracks but the last are quaternions, each with the sign that is nearer to the one before.
+    """
     count, frames, tracks, size = values.shape
+    at, q = np.empty(frames, np.int64), np.empty((frames, size))
+    above, curve = np.empty(frames), np.empty(frames)
     for row in range(count):
-        for t in range(frames):
-            for k in range(tracks):
-                a, b = before[row, t, k], after[row, t, k]
-                if known[row, t, k] or b <= a:
-                    continue
-                s, length = weight[row, t, k], b - a
-                left = a > 0 and known[row, a - 1, k]
-                right = b + 1 < frames and known[row, b + 1, k]
-                if not left and not right:
-                    continue
-                for i in range(size):
-                    p, q = values[row, a, k, i], values[row, b, k, i]
-                    way, start, end = q - p, 0.0, 0.0  # velocities times the gap's length, minus the displacement
-                    if left:
-                        start = p - values[row, a - 1, k, i]
-                        if a > 1 and known[row, a - 2, k]:
-                            start += 0.5 * (p - 2 * values[row, a - 1, k, i] + values[row, a - 2, k, i])
-                        start = length * start - way
-                    if right:
-                        end = values[row, b + 1, k, i] - q
-                        if b + 2 < frames and known[row, b + 2, k]:
-                            end -= 0.5 * (q - 2 * values[row, b + 1, k, i] + values[row, b + 2, k, i])
-                        end = length * end - way
-                    if not right:
-                        end = -0.5 * start
-                    if not left:
-                        start = -0.5 * end
-                    bend = (s * s * s - 2 * s * s + s) * start + (s * s * s - s * s) * end
-                    out[row, t, k, i] = min(max(bend, -MAX_BEND), MAX_BEND)
+        for k in range(tracks):
+            knots = 0
+            for t in range(frames):
+                if known[row, t, k]:
+                    q[knots] = values[row, t, k]
+                    if knots > 0 and k < tracks - 1 and (q[knots] * q[knots - 1]).sum() < 0:
+                        q[knots] *= -1.0
+                    at[knots] = t
+                    knots += 1
+            if knots < 3 or knots == frames:
+                continue
+            for i in range(size):
+                # second derivatives at the knots, 0 at the first and last: a tridiagonal system, by elimination
+                above[0] = curve[0] = curve[knots - 1] = 0.0
+                for n in range(1, knots - 1):
+                    left, right = at[n] - at[n - 1], at[n + 1] - at[n]
+                    pivot = 2.0 * (left + right) - left * above[n - 1]
+                    above[n] = right / pivot
+                    turn = (q[n + 1, i] - q[n, i]) / right - (q[n, i] - q[n - 1, i]) / left
+                    curve[n] = (6.0 * turn - left * curve[n - 1]) / pivot
+                for n in range(knots - 2, 0, -1):
+                    curve[n] -= above[n] * curve[n + 1]
+                for n in range(knots - 1):
+                    length = at[n + 1] - at[n]
+                    for t in range(at[n] + 1, at[n + 1]):
+                        s = (t - at[n]) / length
+                        bend = ((1 - s) ** 3 - 1 + s) * curve[n] + (s**3 - s) * curve[n + 1]
+                        out[row, t, k, i] = (1 - s) * q[n, i] + s * q[n + 1, i] + bend * length * length / 6.0
 
 
 @njit(cache=True)

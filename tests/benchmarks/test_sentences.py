@@ -12,6 +12,7 @@ from steadypose.benchmarks.results import load
 Cell = tuple[str, str, str, str]
 FIT, CLEAN = "HuMoR, as it ships", "steadypose live, delay 8"
 OF_BANK = "of: whole-body bank"
+GAPS = (5, 15, 30, 45)
 SENTENCES: list[tuple[str, str, list[Cell]]] = [
     (
         "README.md",
@@ -48,8 +49,28 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
         r"the same energy has (\S+) mm instead of ([\d.]+)\.",
         [("humor_credit", "humor_rollout", method, "all, mm") for method in ("latents rolled out", "full energy")],
     ),
+    *(
+        (
+            "docs/complete.md",
+            rf"\| {row} " + r"\| (\S+); (\S+) " * len(GAPS) + r"\|",
+            [("interpolation", "interpolation", f"{method}, {gap}", column)
+             for gap in GAPS for column in ("of slerp's", "of lerp's")],
+        ) for row, method in (("completer, L2Q; L2P", "completer"), ("natural cubic spline", "cubic spline"))
+    ),
+    (
+        "docs/complete.md",
+        r"keeps (\S+) to (\S+) times the true acceleration, instead of (\S+) to (\S+)\.",
+        [("interpolation", "interpolation-search", f"{method}, {gap}", "acceleration, of the true")
+         for method in ("HM-VAE searched from there", "completer") for gap in (45, 5)],
+    ),
+    (
+        "docs/complete.md",
+        r"hidden parts is (\S+) to (\S+) of that of the most similar training window",
+        [("completion", "completion", part, "complete, of nearest")
+         for part in ("all but pelvis, chest, head, wrists, ankles", "legs")],
+    ),
 ]  # fmt: skip
-"""Page, sentence with a group for each figure, and where each is: result, table, first cell of the row, column."""
+"""Page, sentence with a group for each figure, and where each is: result, table, first cells of the row, column."""
 
 
 @pytest.mark.parametrize(("page", "sentence", "cells"), SENTENCES)
@@ -58,7 +79,7 @@ def test_a_sentence_quotes_the_result(page: str, sentence: str, cells: list[Cell
     assert found, f"{page}: expected a sentence like {sentence}; if it was rewritten, so must this list be"
     for quoted, (result, table, method, column) in zip(found.groups(), cells, strict=True):
         measured = next(t for t in load()[result]["tables"] if t["name"] == table)
-        row = next(r for r in measured["rows"] if r[0] == method)
+        row = next(r for r in measured["rows"] if method in (r[0], f"{r[0]}, {r[1]}"))
         value = float(row[measured["columns"].index(column)].split()[0])  # an interval may follow
         digits = len(quoted.partition(".")[2])
         assert abs(value - float(quoted)) <= 0.5 * 10**-digits + 1e-9, f"{page}: {quoted}, {result}.json has {value}"

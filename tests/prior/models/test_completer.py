@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from test_hmvae import prepared
 from tests.helpers.bodies import random_pose, waving
@@ -21,8 +21,10 @@ from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import (
     FEATURES,
+    SHARE_FRAMES,
     CompleterConfig,
     anchored,
+    correction_share,
     draw_line,
     read_window,
     solved_rotations,
@@ -111,12 +113,27 @@ def test_the_line_is_slerp_and_lerp_and_its_bend_makes_it_a_cubic() -> None:
     way = window.root[0] @ window.turn[0].T + window.origin[0]
     assert np.allclose(way[9:26], np.linspace(root[9], root[25], 17), atol=1e-9)
     bend = window.bend[0, :, 22, :3] @ window.turn[0].T
-    before = root[9] - root[8] + 0.5 * (root[9] - 2 * root[8] + root[7])
-    after = root[26] - root[25] - 0.5 * (root[25] - 2 * root[26] + root[27])
-    cubic = CubicHermiteSpline([9, 25], root[[9, 25]], [before, after])(np.arange(9, 26))
-    assert np.allclose((way + bend)[9:26], cubic, atol=1e-5)
+    shown = np.r_[:10, 25:31]
+    assert np.allclose(
+        (way + bend)[9:26], CubicSpline(shown, root[shown], bc_type="natural")(np.arange(9, 26)), atol=1e-5
+    )
+    given = Rotation.from_matrix(solved[shown, J["left_knee"]]).as_quat()
+    given *= np.where(given @ given[0] < 0, -1.0, 1.0)[:, None]
+    turned = CubicSpline(shown, given, bc_type="natural")(np.arange(9, 26))
+    columns = (back[:, J["left_knee"], :, :2].swapaxes(1, 2).reshape(31, 6) + window.bend[0, :, J["left_knee"]])[9:26]
+    assert np.allclose(
+        columns, Rotation.from_quat(turned).as_matrix()[..., :2].swapaxes(1, 2).reshape(17, 6), atol=1e-5
+    )
     assert not window.bend[0, :10].any()
     assert not window.bend[0, 25:].any()
+
+
+def test_in_a_short_gap_little_is_taken_from_the_network() -> None:
+    known = np.ones((2, 70, 1), dtype=bool)
+    known[0, 10:15] = known[1, 5:] = False
+    shares = correction_share(draw_line(known))
+    assert np.allclose(shares[0, 10:15], 6 / SHARE_FRAMES)
+    assert (shares[1, 5:] == 1.0).all()
 
 
 def test_the_line_knows_what_is_before_and_after() -> None:
