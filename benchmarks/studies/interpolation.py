@@ -253,9 +253,9 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
         columns=["method", "gap, frames", *(text for text, _ in columns.values())],
         rows=[[r["method"], str(r["gap"]), *(cell(r) for _, cell in columns.values())] for r in rows],
         note=(
-            f"{clips} clips, spread evenly over the sources. Baselines have the rotations of the file; where joints are "
-            "given, rotations solved from them, as the completer. On LAFAN1, which is other motion on another skeleton, "
-            "the two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56 and 0.70 of slerp's L2Q at 5, 15, 30 and "
+            f"{clips} clips, spread evenly over the sources. Baselines have the rotations of the file; where joints "
+            "are given, those solved from them, as the completer. On LAFAN1, which is another skeleton and motion, "
+            "the two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56, 0.70 of slerp's L2Q at 5, 15, 30 and "
             "45 frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's."
         ),
     )
