@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.types import Message, PoseClean, PoseRaw, PoseWorld
+from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.checks.stamps import check_length
 from steadypose.nodes.checks.stream import StreamCheck
@@ -35,6 +35,9 @@ CHECKED, CHECKED_NS = 45, 1_500_000_000
 
 NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are the units metres?"
 """Problem text of an input without any recognised body."""
+
+LYING = ("up_axis", "not_upright")
+"""Causes of problems that somebody who lies or leans for a while also has."""
 
 Settings = Mapping[str, Mapping[str, Any]]
 
@@ -69,6 +72,9 @@ class Diagnosis:
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
         self._last_ns = 0
+        self._useless = False
+        self._inhabited = False
+        self._looks = self._lying = 0
         self.frames = 0
 
     def see(self, raw: PoseRaw) -> None:
@@ -76,11 +82,17 @@ class Diagnosis:
         self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
         self._first_ns = raw.stamp_ns if self._first_ns is None else self._first_ns
         self._last_ns = raw.stamp_ns
+        self._inhabited |= bool(raw.bodies)
         self.frames += 1
 
     def look(self) -> list[str]:
         """Examine the last frames. Returns the new problems, one line each."""
-        return self._note(self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False))
+        found = self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False)
+        self._useless |= any(problem.level == Level.ERROR for problem in found)
+        self._looks += self._inhabited
+        self._lying += any(problem.cause in LYING for problem in found)
+        self._inhabited = False
+        return self._note(found)
 
     def end(self) -> list[str]:
         """End the stream; another may follow. Returns as `look`, including whether the stream was too short."""
@@ -94,6 +106,11 @@ class Diagnosis:
         new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}
         self.problems |= new
         return [f"{cause}: {text}" for cause, text in new.items()]
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the output can be trusted: no problem is an ERROR, and bodies do not lie or lean most of the time."""
+        return not self._useless and 2 * self._lying <= self._looks
 
     @property
     def texts(self) -> list[str]:

@@ -15,8 +15,8 @@ import signal
 import subprocess
 import sys
 import traceback
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection, Pipe, wait
@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.nodes.cli import told_of
-from steadypose.nodes.commands.output import clean_recording
+from steadypose.nodes.commands.output import UNTRUSTED, clean_recording
 from steadypose.nodes.driving import NOBODY, Settings
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.process import own_command, own_environment
@@ -103,7 +103,7 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     """Clean all recordings of a folder that are not cleaned yet: ``jobs`` at once (None: one a core), or with Ray.
 
     Returns:
-        the exit status: 1 if one could not be cleaned, shows nobody, or could not be read to the end.
+        the exit status: 0 if all are clean, those that were done before included.
 
     Raises:
         LaunchError: nothing can be done at all.
@@ -115,35 +115,55 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
         raise LaunchError("--jobs: " + ("Ray decides how many" if ray else f"expected 1 or more, got {jobs}"))
     found = plan(folder, out)
     manifest = Manifest(out, folder, settings)
-    waiting = [replace(job, replace=manifest.made(job.out)) for job in found if not manifest.is_done(job)]
-    if known := len(found) - len(waiting):
-        console.print(f"{known} of {len(found)} are done already; see {manifest.path}")
+    done = {job: result for job in found if (result := manifest.result(job))}
+    waiting = [replace(job, replace=manifest.made(job.out)) for job in found if job not in done]
+    if done:
+        console.print(f"{len(done)} of {len(found)} are done already; see {manifest.path}")
     for job in waiting:
         if job.replace or not os.path.lexists(job.out):
             manifest.add(job, {"state": "started"})
     cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
-    failed = damaged = empty = 0
+    outcomes = Counter(outcome(result) for result in done.values())
     with Progress(console=console, disable=not console.is_terminal) as progress:
-        bar = progress.add_task(folder.name, total=len(found), completed=known)
+        bar = progress.add_task(folder.name, total=len(found), completed=len(done))
         for job, result in cleaning:
             manifest.add(job, result)
             progress.advance(bar)
-            if result["state"] == "failed":
-                failed += 1
-                cause = str(result["error"]).removeprefix(f"{job.source}: ")
-                console.print(f"{job.source}: {cause}", style="red")
-            elif result["unread"]:
-                damaged += 1
-                causes = ", ".join(f"{cause}: {n}" for cause, n in result["unread"].items())
-                console.print(f"{job.source}: damaged; {causes}", style="red")
-            elif not result["poses"]:
-                empty += 1
-                console.print(f"{job.source}: {NOBODY}", style="red")
+            outcomes[outcome(result)] += 1
             for problem in result.get("problems", ()):
                 console.print(f"{job.source}: {problem}", style="yellow")
-    nobody = f"; {empty} of them without anybody in it" if empty else ""
-    console.print(f"{out}: {len(found) - failed} of {len(found)} recordings are clean{nobody}")
-    return 1 if failed or damaged or empty else 0
+            if fault := _fault(job, result):
+                console.print(f"{job.source}: {fault}", style="red")
+    others = ", ".join(f"{count} {what}" for what, count in outcomes.items() if what != CLEAN)
+    console.print(f"{out}: {outcomes[CLEAN]} of {len(found)} recordings are clean{others and f'; {others}'}")
+    return 0 if outcomes[CLEAN] == len(found) else 1
+
+
+CLEAN, FAILED, EMPTY, DAMAGED, DOUBTFUL = "clean", "failed", "without anybody in it", "damaged", "not to be trusted"
+"""what may become of a recording"""
+
+
+def outcome(result: Mapping[str, Any]) -> str:
+    """What became of a recording, by its entry in the manifest."""
+    if result["state"] == "failed":
+        return FAILED
+    if not result["poses"]:
+        return EMPTY
+    if result["unread"]:
+        return DAMAGED
+    return CLEAN if result.get("trusted", True) else DOUBTFUL  # earlier versions did not note it
+
+
+def _fault(job: Job, result: Mapping[str, Any]) -> str:
+    """Why a recording is not clean; empty if it is."""
+    damage = ", ".join(f"{cause}: {n}" for cause, n in result.get("unread", {}).items())
+    return {
+        CLEAN: "",
+        FAILED: str(result.get("error")).removeprefix(f"{job.source}: "),
+        EMPTY: NOBODY,
+        DAMAGED: f"damaged; {damage}",
+        DOUBTFUL: UNTRUSTED,
+    }[outcome(result)]
 
 
 class Manifest:
@@ -184,10 +204,11 @@ class Manifest:
             for entry in self._known.values()
         )
 
-    def is_done(self, job: Job) -> bool:
-        """Whether this recording, as it is now, was cleaned with these settings."""
+    def result(self, job: Job) -> dict[str, Any] | None:
+        """The result of this recording, as it is now, with these settings; None if it was not cleaned so."""
         entry = self._known.get(str(job.source.relative_to(self._folder)), {})
-        return entry.get("state") == "done" and job.out.exists() and entry.items() >= self._signature(job).items()
+        done = entry.get("state") == "done" and job.out.exists() and entry.items() >= self._signature(job).items()
+        return entry if done else None
 
     def add(self, job: Job, result: dict[str, Any]) -> None:
         """Note what became of a recording."""

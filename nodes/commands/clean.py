@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.output import (
+    UNTRUSTED,
     File,
     In,
     Out,
@@ -42,8 +43,11 @@ def clean(
 
     Given a folder, it cleans each recording in it into another folder, in parallel on all cores or on a Ray cluster.
     OUT/manifest.jsonl lists the result of each recording. If you run the command again, it does only what is left. A
-    recording that cannot be cleaned does not stop the others. The exit status is 1 if a recording cannot be cleaned,
-    shows nobody, or is damaged.
+    recording that cannot be cleaned does not stop the others.
+
+    OUT is written whatever is wrong with the poses. The exit status is 1 if it cannot be trusted (units, axes or joint
+    order are wrong, or there is nobody) or IN is damaged; of a folder, if this holds for a recording, or one cannot be
+    cleaned.
 
     Args:
         source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
@@ -106,8 +110,10 @@ def clean(
         terminal.print(f"  not used as given, {cause}: {count}")
     for problem in done.problems:
         terminal.print(f"  {problem}", style="yellow")
+    if done.poses and not done.trusted:
+        terminal.print(f"  {UNTRUSTED}", style="red")
     if not done.poses:
         terminal.print(f"  {NOBODY}; `steadypose info {source}` shows what it contains", style="red")
     if done.unread:
         terminal.print(f"  {source} is damaged: the readable part is cleaned", style="red")
-    return 1 if done.unread or not done.poses else 0
+    return 1 if done.unread or not done.poses or not done.trusted else 0

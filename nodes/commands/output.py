@@ -36,6 +36,7 @@ Out = Annotated[Path, tyro.conf.arg(metavar="OUT")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 ARRAY_FILES = (".npz", ".csv")
 """endings of outputs that are one file of arrays"""
+UNTRUSTED = "the output cannot be trusted, because of the problems above"
 OTHER_FORMATS = {
     *(".npy", ".json", ".jsonl", ".txt", ".tsv", ".xlsx", ".pkl", ".pt", ".h5", ".hdf5", ".mat", ".parquet", ".bag"),
     *(".bvh", ".fbx", ".glb", ".gltf", ".c3d", ".trc", ".mp4", ".gif", ".png"),
@@ -168,6 +169,7 @@ class Cleaned:
         poses: number of poses in the output; 0 if no body was recognised.
         refused: what was refused or dropped, by cause.
         problems: what is wrong with the input, each as it was first found.
+        trusted: whether the output can be trusted in spite of them.
         unread: what of it the input holds and could not be read, because it is damaged.
     """
 
@@ -177,6 +179,7 @@ class Cleaned:
     poses: int
     refused: dict[str, int]
     problems: list[str]
+    trusted: bool
     unread: dict[str, int]
 
 
@@ -235,5 +238,6 @@ def clean_recording(
         poses=run.poses,
         refused=dict(run.refused),
         problems=run.diagnosis.texts,
+        trusted=run.diagnosis.trusted,
         unread={cause: n for cause, n in frames.refused.items() if n},
     )

@@ -14,6 +14,8 @@ from tests.nodes.conftest import walked, write_npz
 
 import steadypose
 from steadypose.nodes.cli import main
+from steadypose.nodes.driving import OfflineRun
+from steadypose.nodes.library.arrays import sections, source_of
 
 FRAMES = 50
 
@@ -290,5 +292,32 @@ def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> N
     write_npz(tmp_path / "in" / "empty.npz", np.full((60, 1, 22, 3), np.nan))
     assert main(["clean", str(tmp_path / "in" / "empty.npz"), str(tmp_path / "out.npz")]) == 1
     assert "nobody_recognised: no body in any frame" in capsys.readouterr().err
-    assert main(["clean", str(tmp_path / "in"), str(tmp_path / "out"), "--jobs", "1"]) == 1
-    assert "1 of them without anybody in it" in capsys.readouterr().err
+    for _ in ("the first time", "done already"):
+        assert main(["clean", str(tmp_path / "in"), str(tmp_path / "out"), "--jobs", "1"]) == 1
+        assert "0 of 1 recordings are clean; 1 without anybody in it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("factor", "order", "cause"), [(1000.0, (0, 1, 2), "unit: "), (1.0, (1, 2, 0), "up_axis: ")])
+def test_what_cannot_be_trusted_is_written_and_the_exit_status_is_1(
+    factor: float, order: tuple[int, ...], cause: str, joints: np.ndarray, tmp_path: Path, capsys
+) -> None:
+    write_npz(tmp_path / "in.npz", factor * joints[..., order])
+    assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 1
+    told = capsys.readouterr().err
+    assert cause in told
+    assert "the output cannot be trusted" in told or "nobody_recognised" in told
+    assert (tmp_path / "out.npz").exists()
+
+
+def test_who_lies_for_a_while_is_no_reason_to_distrust_a_recording(joints: np.ndarray) -> None:
+    lying = joints[..., (1, 2, 0)]
+
+    def run(*parts: np.ndarray) -> OfflineRun:
+        run = OfflineRun(source_of(np.concatenate(parts), fps=30), sections(None, 4))
+        run.arrays()
+        return run
+
+    fell = run(joints, joints, lying)
+    assert list(fell.diagnosis.problems) == ["up_axis"]
+    assert fell.diagnosis.trusted
+    assert not run(lying, lying, lying, joints).diagnosis.trusted
