@@ -132,8 +132,14 @@ def forms_of(kind: type) -> dict[str, Form]:
     return {f.name: f.type.__metadata__[0] for f in fields(kind) if hasattr(f.type, "__metadata__")}  # pyright: ignore
 
 
+_SHORT = 7
+"""Largest array that `repr` shows; of others it shows the shape."""
+
+
 class _Record:
-    """Equality by value, because a dataclass's own cannot compare arrays; and the checks of the constructors."""
+    """Equality and `repr` by value, because a dataclass's own cannot compare arrays, and prints them whole; and the
+    checks of the constructors.
+    """
 
     __slots__ = ()
     __hash__ = None  # type: ignore[assignment]
@@ -143,6 +149,12 @@ class _Record:
             return NotImplemented
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))  # type: ignore[arg-type]
 
+    def __repr__(self) -> str:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        large = {name for name, value in values.items() if isinstance(value, np.ndarray) and value.size > _SHORT}
+        parts = (f"{name}=<{value.shape}>" if name in large else f"{name}={value!r}" for name, value in values.items())
+        return f"{type(self).__name__}({', '.join(parts)})"
+
     def __post_init__(self) -> None:
         for name, form in forms_of(type(self)).items():
             try:
@@ -151,7 +163,7 @@ class _Record:
                 raise ValueError(f"{type(self).__name__}.{name}: {error}") from error
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class Pose(_Record):
     """The pose of a frame in the z-up world: world = orientation · point + position."""
 
@@ -183,7 +195,7 @@ class Pose(_Record):
         return cls(np.zeros(3), np.array([x, 0.0, 0.0, w]))
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class RawBody(_Record):
     """One body as given by the sensor, in the joints of the message's skeleton."""
 
@@ -201,7 +213,7 @@ class RawBody(_Record):
             raise ValueError(f"RawBody.confidence: {shapes}")
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class PoseRaw(_Record):
     """`pose/raw`: the bodies that a skeleton source observed at one time."""
 
@@ -222,7 +234,7 @@ class PoseRaw(_Record):
     """whether the stream ends here; sent once, without bodies"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class CleanBody(_Record):
     """One body as estimated by the prior, in the canonical joints `JOINTS`."""
 
@@ -252,7 +264,7 @@ class CleanBody(_Record):
     """(22,) 0 to 1"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class PoseClean(_Record):
     """`pose/clean`: the bodies at one time, refined and completed, in the sensor's frame."""
 
@@ -273,7 +285,7 @@ class PoseClean(_Record):
     """whether the stream ends here; sent once, without bodies"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class WorldBody(_Record):
     """One body in the world, in the canonical joints `JOINTS`."""
 
@@ -301,7 +313,7 @@ class WorldBody(_Record):
     tracking: Annotated[Tracking, Integer(0, len(Tracking), Tracking)]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class PoseWorld(_Record):
     """`pose/world`: the bodies at one time, in the world. `pose/truth` has the same form."""
 
@@ -318,7 +330,7 @@ class PoseWorld(_Record):
     """whether the stream ends here; sent once, without bodies"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class Event(_Record):
     """An event of one body."""
 
@@ -336,7 +348,7 @@ class Event(_Record):
     """capture time at which the event began, nanoseconds"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class PoseEvents(_Record):
     """`pose/events`: all events that begin, hold or end at one time. Sent once a second and when one begins or ends."""
 
@@ -351,7 +363,7 @@ class PoseEvents(_Record):
     """whether the stream ends here; sent once, without events"""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, repr=False)
 class Diagnostics(_Record):
     """`diagnostics`: the state of one node; on the wire a diagnostic_msgs/DiagnosticArray with one status."""
 

@@ -6,20 +6,21 @@ A subcommand is a typed function with a docstring. Its module is imported only w
 
 from __future__ import annotations
 
-import difflib
 import importlib
+import inspect
 import os
 import re
 import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from importlib.metadata import version
 from io import StringIO
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
-from steadypose.nodes.extras import extra_of, how_to_install
+from steadypose.nodes.extras import extra_of, how_to_install, upgrade_and_uninstall
+from steadypose.prior.settings import nearest
 
 EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
@@ -46,6 +47,8 @@ COMMANDS = {
 }
 """Module and one-line help of each command. Modules without a dot in their name are in `nodes.commands`."""
 
+TOPICS = ("upgrade", "uninstall")
+"""What `help` explains beside the commands."""
 USAGE_ERROR = 2
 """Exit status of a request that cannot succeed and should not be retried."""
 INTERRUPTED = 130
@@ -64,6 +67,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _main(arguments: list[str]) -> int:
+    if len(arguments) > 1 and arguments[0] == "help":
+        if (topic := arguments[1]) in TOPICS:
+            print(upgrade_and_uninstall())
+            return 0
+        if topic not in COMMANDS:
+            return _unknown(f"no help on {topic!r}", topic, (*TOPICS, *COMMANDS))
+        arguments = [topic, "--help"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage())
         return 0
@@ -72,10 +82,7 @@ def _main(arguments: list[str]) -> int:
         return 0
     name = arguments[0]
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COMMANDS)}"
-        print(f"steadypose: no command {name!r}: {hint}", file=sys.stderr)
-        return USAGE_ERROR
+        return _unknown(f"no command {name!r}", name, COMMANDS)
     if name == "node":  # OpenBLAS creates its threads (9 MB) when it is loaded, before `one_thread` could prevent it
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -90,6 +97,11 @@ def _main(arguments: list[str]) -> int:
     return status if isinstance(status, int) else 0
 
 
+def _unknown(what: str, name: str, known: Iterable[str]) -> int:
+    print(f"steadypose: {what}{nearest(name, known) or ': there are ' + ', '.join(known)}", file=sys.stderr)
+    return USAGE_ERROR
+
+
 def _run(name: str, arguments: list[str]) -> object:
     place, _ = COMMANDS[name]
     module = importlib.import_module(place if "." in place else f"steadypose.nodes.commands.{place}")
@@ -100,7 +112,7 @@ def _run(name: str, arguments: list[str]) -> object:
 
     asks = not {"-h", "--help"}.isdisjoint(arguments)
     if asks:
-        _join_lines(vars(module).values())
+        _prepare_help(vars(module).values())
     with _wrapped() if asks else nullcontext():
         return tyro.cli(
             command,
@@ -110,13 +122,22 @@ def _run(name: str, arguments: list[str]) -> object:
         )
 
 
-def _join_lines(documented: Iterable[Any]) -> None:
-    """Join each argument's description into one line, because tyro keeps the source's line breaks."""
+def _prepare_help(documented: Iterable[Any]) -> None:
+    """Join each argument's description into one line, because tyro keeps the source's line breaks; and have tyro leave
+    out "(default: None)", because the description says what happens without the argument.
+    """
+    from tyro.conf import arg
+
     for thing in documented:
         doc = getattr(thing, "__doc__", None) or ""
         if callable(thing) and "\n    Args:\n" in doc:
             described, heading, listed = doc.partition("\n    Args:\n")
             thing.__doc__ = described + heading + re.sub(r"\n {12}(?=\S)", " ", listed)
+            with suppress(NameError):  # of a class that is imported, and annotated for type checkers alone
+                hints = get_type_hints(thing, include_extras=True)
+                for name, parameter in inspect.signature(thing).parameters.items():
+                    if parameter.default is None and name in hints:
+                        thing.__annotations__[name] = Annotated[hints[name], arg(help_behavior_hint="")]
 
 
 @contextmanager
@@ -155,6 +176,7 @@ def usage() -> str:
             "commands:",
             *lines,
             "\nOptions: `steadypose COMMAND --help`. `steadypose run` plays a bundled stream.",
+            "To upgrade: `steadypose help upgrade`. To remove: `steadypose help uninstall`.",
         )
     )
 

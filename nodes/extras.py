@@ -65,15 +65,42 @@ def how_to_install(missing: Sequence[str], extra: str) -> str:
     )
 
 
+def upgrade_and_uninstall() -> str:
+    """How to upgrade and remove this installation (docs/library.md has all cases)."""
+    checkout = _checkout()
+    if checkout is not None and _is_its_own(checkout):
+        upgrade, uninstall = f"git -C {checkout} pull; the next call installs what changed", f"delete {checkout}"
+    else:
+        place = checkout or "PATH/TO/CHECKOUT"
+        upgrade = f"git -C {place} pull, then pip install --upgrade {place}"
+        uninstall = "pip uninstall steadypose"
+    return (
+        f"upgrade:   {upgrade}\n"
+        f"uninstall: {uninstall}; before that, if you installed a service,\n"
+        "           sudo steadypose install-service --uninstall\n\n"
+        "Outside the paths that you name, steadypose writes only compiled code beside the package, and sockets.\n"
+        "CHANGELOG.md in the checkout says what has changed."
+    )
+
+
+def _checkout() -> Path | None:
+    """The checkout that this package lies in; None if it was copied into an environment."""
+    root = PACKAGE.parents[1]
+    return root if (root / "pyproject.toml").exists() else None
+
+
+def _is_its_own(checkout: Path) -> bool:
+    """Whether this Python is that of the checkout's own `.venv`, which `./steadypose` makes."""
+    return Path(sys.prefix) == checkout / ".venv"
+
+
 def install_command(extra: str = "") -> str:
     """The command that installs an extra, or reinstalls steadypose, for this Python.
 
     It names the checkout, because steadypose is not on the package index yet.
     """
-    if (PACKAGE.parents[1] / "pyproject.toml").exists():
-        checkout = str(PACKAGE.parents[1])
-        if Path(sys.prefix) == Path(checkout, ".venv"):
-            return f"./steadypose add {extra}" if extra else "rm -f .venv/.installed-* && ./steadypose doctor"
-    else:
-        checkout = "PATH/TO/CHECKOUT"
+    checkout = _checkout()
+    if checkout is not None and _is_its_own(checkout):
+        return f"./steadypose add {extra}" if extra else "rm -f .venv/.installed-* && ./steadypose doctor"
+    checkout = checkout or "PATH/TO/CHECKOUT"
     return f"pip install '{checkout}[{extra}]'" if extra else f"pip install --upgrade --force-reinstall {checkout}"

@@ -80,9 +80,8 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
     known = [f.name for f in fields(cls)]
     for key, value in settings.items():
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"expected one of {', '.join(known)}"
-            raise ValueError(f"{f'[{path}]' if path else 'a launch file'} has no setting '{key}': {hint}")
+            hint = nearest(key, known) or f": expected one of {', '.join(known)}"
+            raise ValueError(f"{f'[{path}]' if path else 'a launch file'} has no setting '{key}'{hint}")
         default, name = getattr(defaults, key), f"[{path}] {key}" if path else key
         if is_dataclass(default):
             if not isinstance(value, Mapping):

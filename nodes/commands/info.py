@@ -171,7 +171,8 @@ def describe_file(path: Path) -> Iterator[str]:
             stamps.append(message.stamp_ns / 1e9)
             skeletons.add(message.skeleton)
             for body in message.bodies:
-                if (there := np.isfinite(body.positions).all(axis=-1)).any():
+                # in an output, imputed joints have a confidence of 0
+                if (there := np.isfinite(body.positions).all(axis=-1) & (body.confidence > 0)).any():
                     ids.add(body.id)
                     seen.append(there.mean())
     rate = Rate(stamps)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import logging
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,6 +50,25 @@ class InputWarning(UserWarning):
 
 
 logger = logging.getLogger("steadypose")
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def suggesting(function: Callable[P, R]) -> Callable[P, R]:
+    """A public function that answers an unknown keyword with the most similar one that it has."""
+    known = inspect.signature(function).parameters
+    name = function.__qualname__.removesuffix(".__init__").removesuffix(".__call__")
+
+    @wraps(function)
+    def checked(*given: P.args, **named: P.kwargs) -> R:
+        for keyword in named:
+            if keyword not in known:
+                raise TypeError(f"{name}() has no argument {keyword!r}{nearest(keyword, known)}")
+        return function(*given, **named)
+
+    return checked
 
 
 def compile_loops() -> None:
@@ -128,9 +149,10 @@ def source_of(
     if skeleton is not None:
         stated["skeleton"] = np.array(skeleton_name(skeleton))
     if isinstance(positions, (str, os.PathLike)):
+        source = open_recording(Path(positions))  # says first if there is no such file
         if stated:
             raise NpzError(f"{positions}: expected no {', '.join(stated)} beside a file, which contains it")
-        return open_recording(Path(positions))
+        return source
     if fps is not None and stamp_ns is not None:
         raise NpzError("expected fps, of a regular stream, or stamp_ns, got both; leave fps out")
     if isinstance(positions, Mapping):
@@ -162,6 +184,7 @@ def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
     return array
 
 
+@suggesting
 def clean(
     positions: Positions,
     *,
@@ -213,6 +236,7 @@ def clean(
     return Poses(arrays, problems, run.refused, timeline.events())
 
 
+@suggesting
 def complete(
     positions: Positions,
     *,
@@ -248,6 +272,7 @@ def complete(
     return Poses(completed.arrays(), refused=completed.refused)
 
 
+@suggesting
 def fit(
     positions: Positions,
     *,
@@ -290,6 +315,7 @@ def fit(
     return Poses(fitted.arrays(), problems)
 
 
+@suggesting
 def plot(poses: Positions, output: str | Path | None = None, *, body: int | None = None) -> Figure:
     """Plot poses, as `steadypose plot` does.
 

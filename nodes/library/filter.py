@@ -19,7 +19,15 @@ from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.nodes.library.arrays import SkeletonLike, as_array, compile_loops, sections, skeleton_name, warn
+from steadypose.nodes.library.arrays import (
+    SkeletonLike,
+    as_array,
+    compile_loops,
+    sections,
+    skeleton_name,
+    suggesting,
+    warn,
+)
 from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.timeline import FrameEvents, TimedEvent
@@ -58,6 +66,7 @@ class Filter:
         ValueError: an unknown skeleton, axis or setting.
     """
 
+    @suggesting
     def __init__(
         self,
         skeleton: SkeletonLike = "smpl22",
@@ -90,6 +99,7 @@ class Filter:
         self._several = False
         self._recognised = False
 
+    @suggesting
     def __call__(
         self,
         joints: ArrayLike,
@@ -121,6 +131,7 @@ class Filter:
         found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
         return found[-1] if found else None
 
+    @suggesting
     def update(
         self,
         joints: ArrayLike,

@@ -169,9 +169,7 @@ class Poses(dict[str, NDArray[Any]]):
             AttributeError: nobody looked for events.
         """
         if self._events is None:
-            raise AttributeError(
-                "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
-            )
+            raise AttributeError(NO_EVENTS)
         return self._events
 
     @property
@@ -238,11 +236,28 @@ class Poses(dict[str, NDArray[Any]]):
         return pandas.concat(tables, ignore_index=True).sort_values(["t", "body"], ignore_index=True)
 
     def __repr__(self) -> str:
-        return f"<Poses {', '.join(f'{name} {array.shape}' for name, array in self.items())}>"
+        return _shapes("Poses", self)
+
+    if not TYPE_CHECKING:  # so that type checkers still find a wrong name
+
+        def __getattr__(self, name: str) -> Any:
+            if name == "events":  # Python also asks here for a property that raised AttributeError
+                raise AttributeError(NO_EVENTS)
+            raise AttributeError(f"Poses has no attribute {name!r}{nearest(name, dir(self))}")
+
+        def __missing__(self, name: str) -> Any:
+            raise KeyError(f"no array {name!r}{nearest(name, self)}; there are {', '.join(self)}")
 
     def _by_name(self, name: str) -> ByName:
         first, *others = AXES[name]
         return ByName.of(self[name], CONTACTS if first == "contact" else JOINTS, -1 - len(others))
+
+
+NO_EVENTS = "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
+
+
+def _shapes(kind: str, arrays: Mapping[str, NDArray[Any]]) -> str:
+    return f"<{kind} {', '.join(f'{name} {array.shape}' for name, array in arrays.items())}>"
 
 
 def _installed(name: str) -> Any:
@@ -282,6 +297,9 @@ class Sample:
     positions: NDArray[np.float64]
     stamp_ns: NDArray[np.int64]
     truth: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        return _shapes("Sample", vars(self))
 
 
 def sample(name: str = BUNDLED) -> Sample:

@@ -96,7 +96,10 @@ def __getattr__(name: str) -> Any:
         return version("steadypose")
     if name in _MODULES:
         return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    from steadypose.prior.settings import nearest
+
+    hint = nearest(name, __all__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}; it has {', '.join(__all__)}")
 
 
 def __dir__() -> list[str]:

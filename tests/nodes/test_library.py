@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,8 +52,34 @@ def test_several_bodies() -> None:
 
 
 def test_what_is_missing_is_named() -> None:
-    with pytest.raises(AttributeError, match="cleanse"):
+    with pytest.raises(AttributeError, match="has no attribute 'cleanse', did you mean 'clean'"):
         steadypose.cleanse  # noqa: B018  # type: ignore[attr-defined]
+    poses = steadypose.Poses({"positions": np.zeros((2, 22, 3))})
+    with pytest.raises(AttributeError, match="has no attribute 'postions', did you mean 'positions'"):
+        poses.postions  # noqa: B018  # type: ignore[attr-defined]
+    with pytest.raises(KeyError, match="no array 'postions', did you mean 'positions'"):
+        poses["postions"]
+    with pytest.raises(AttributeError, match=r"expected poses of steadypose\.clean"):
+        poses.events  # noqa: B018
+    for call, name, near in (
+        (steadypose.clean, "fsp", "fps"),
+        (steadypose.complete, "weight", "weights"),
+        (steadypose.fit, "point", "points"),
+        (steadypose.plot, "ouput", "output"),
+        (steadypose.Filter, "skeletn", "skeleton"),
+    ):
+        arguments: Any = () if call is steadypose.Filter else (WALK,)
+        with pytest.raises(TypeError, match=rf"{call.__name__}\(\) has no argument '{name}', did you mean '{near}'"):
+            call(*arguments, **{name: 3})
+
+
+def test_what_holds_arrays_shows_their_shapes() -> None:
+    assert repr(steadypose.sample()) == "<Sample positions (619, 22, 3), stamp_ns (619,), truth (619, 22, 3)>"
+    body = steadypose.RawBody(3, WALK[0], np.ones(22))
+    raw = steadypose.PoseRaw(7, "camera", "mine", "smpl22", steadypose.Pose.from_up("z"), False, [body])
+    assert repr(body) == "RawBody(id=3, positions=<(22, 3)>, confidence=<(22,)>)"
+    assert repr(raw).endswith(f"bodies=[{body!r}], end_of_stream=False)")
+    assert repr(raw.sensor_pose) == "Pose(position=array([0., 0., 0.]), orientation=array([0., 0., 0., 1.]))"
 
 
 def test_the_first_is_ten_lines() -> None:

@@ -94,9 +94,13 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "None for a missing joint": (lambda j: steadypose.clean(with_none(j), fps=30), "NaN"),
     "a file that does not exist": (lambda j: steadypose.clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
+    "a file that does not exist, and its rate": (
+        lambda j: steadypose.clean("hello", fps=30),
+        r"hello does not exist: expected",
+    ),
     "a setting that there is not": (
         lambda j: steadypose.clean(j, fps=30, settings={"prior": {"delya": 2}}),
-        "has no setting 'delya': did you mean 'delay'",
+        "has no setting 'delya', did you mean 'delay'",
     ),
     "a section that there is not": (
         lambda j: steadypose.Filter(settings={"prior.delay": 2}),  # type: ignore[arg-type]
@@ -140,7 +144,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "an event's threshold that there is not": (
         lambda j: steadypose.clean(j, fps=30, settings={"events": {"neer": 2.0}}),
-        r"\[events\] has no setting 'neer': did you mean 'near'",
+        r"\[events\] has no setting 'neer', did you mean 'near'",
     ),
     "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
 }
@@ -170,7 +174,7 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     "a launch file with a mistyped key": (
         ["run", "mine.toml"],
         {"mine.toml": "[input]\nrecording = 'walk_turn'\n[prior.gate]\njmup = 2"},
-        "[prior.gate] has no setting 'jmup': did you mean 'jump'?",
+        "[prior.gate] has no setting 'jmup', did you mean 'jump'?",
     ),
     "weights that there are not": (
         ["run", "replay", "--set", "smooth.weights=mine"],

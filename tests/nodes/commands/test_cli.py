@@ -28,7 +28,7 @@ def test_help_lists_every_command_and_imports_almost_nothing() -> None:
     for name, (_, what) in COMMANDS.items():
         assert f"  {name}" in out
         assert what in out
-    assert out.endswith("bundled stream.\n"), "and none of those modules"
+    assert out.endswith("`steadypose help uninstall`.\n"), "and none of those modules"
 
 
 def test_every_command_is_where_it_is_said_to_be() -> None:
@@ -37,6 +37,22 @@ def test_every_command_is_where_it_is_said_to_be() -> None:
         assert spec is not None, module
         assert spec.origin is not None
         assert f"def {command.replace('-', '_')}(" in Path(spec.origin).read_text()
+
+
+def test_help_explains_upgrading_uninstalling_and_each_command(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("sys.prefix", "/somewhere/else")
+    manual = (Path(__file__).parents[3] / "docs" / "library.md").read_text()
+    for topic in ("upgrade", "uninstall"):
+        assert main(["help", topic]) == 0
+        told = capsys.readouterr().out
+        for command in ("pip install --upgrade", "pip uninstall steadypose"):
+            assert command in told
+            assert command in manual
+    with pytest.raises(SystemExit):
+        main(["help", "keys"])
+    assert "usage: steadypose keys" in capsys.readouterr().out
+    assert main(["help", "upgrad"]) == USAGE_ERROR
+    assert "no help on 'upgrad', did you mean 'upgrade'?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -142,7 +158,9 @@ for missing, (_, arguments) in {lacking}.items():
     assert not any("Traceback" in line for line in told)
 
 
-@pytest.mark.parametrize("command", [["run"], pytest.param(["train"], marks=pytest.mark.slow), ["calibrate", "sensor"]])
+@pytest.mark.parametrize(
+    "command", [["run"], ["clean"], pytest.param(["train"], marks=pytest.mark.slow), ["calibrate", "floor"]]
+)
 def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
@@ -150,6 +168,7 @@ def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monke
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     words = {word for line in lines for word in line.split()}
+    assert "None)" not in words, "no default beside the one that is described"
     assert words >= {"steadypose", "options"}
     assert not any(line.strip() in ("the", "own", "any") for line in lines), "no line of a docstring shows"
     assert main(["help"]) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,10 @@ def test_info_says_what_is_in_it(cleaned: Path, capsys) -> None:
     assert "imputed" in told
     assert "skeleton smpl22" in told
     assert main(["info", str(cleaned / "walk.csv")]) == 0
-    assert f"{FRAMES} frames" in capsys.readouterr().out
+    of_table = capsys.readouterr().out
+    assert f"{FRAMES} frames" in of_table
+    assert re.search(r"\d+% of their joints observed", of_table)[0] in told  # type: ignore[index]
+    assert "100% of" not in told
 
 
 def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:

@@ -88,10 +88,10 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input", "is not TOML"),
         ("delay = 2", r"delay is in no section: expected \[prior\] delay"),
         ("[input]\nloop = 'yes'", "loop: expected true or false, got 'yes'"),
-        ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya': did you mean 'delay'"),
-        ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup': did you mean 'jump'"),
+        ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya', did you mean 'delay'"),
+        ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup', did you mean 'jump'"),
         ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
-        ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok': did you mean 'network'"),
+        ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok', did you mean 'network'"),
     ],
 )
 def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expected: str) -> None:
