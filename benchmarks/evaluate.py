@@ -37,7 +37,7 @@ def evaluate(
 
     Args:
         study: what to measure, or 'all' studies except those of the whole system (latency, scale, restart, soak,
-            events).
+            events, retarget).
         split: split of the prepared motion to score. Kinect, MediaPipe and force plates have none.
         quick: use a few clips and points, to check that everything works.
         mocap: folder with ui_prmd.npz, mediapipe_pose.npz and contacts_grf.npz, for the studies of these sensors;

@@ -9,5 +9,6 @@ SYSTEMS: dict[str, str] = {
     "restart": "seconds without poses at the start and after a kill",
     "soak": "faults into nodes at work for an hour, and what became of each frame",
     "events": "events of simulated people",
+    "retarget": "computing time, joint limits and standing feet of a robot that follows a person",
 }
 """Description of what each module of this package measures."""

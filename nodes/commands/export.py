@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, unfinished
 from steadypose.nodes.driving import stream
@@ -133,9 +134,10 @@ def retarget(
     follower = Follower(Retargeter(robot, sole), body)
     frames = 0
     poses = []
-    for _, message in stream(open_recording(source), make_prior({}), make_trajectory({})):
+    for topic, message in stream(open_recording(source), make_prior({}), make_trajectory({})):
         frames += isinstance(message, PoseRaw) and not message.end_of_stream
-        if isinstance(message, PoseWorld) and (pose := follower.process(message)) is not None:
+        # a simulated recording also has its truth, as PoseWorld
+        if topic == POSE_WORLD and isinstance(message, PoseWorld) and (pose := follower.process(message)) is not None:
             poses.append(pose)
     if not poses:
         whom = "nobody" if body is None else f"no body {body}"

@@ -7,6 +7,7 @@ from typing import Any
 
 import bvhio
 import numpy as np
+import pandas
 import pytest
 from numpy.typing import NDArray
 from pygltflib import GLTF2
@@ -18,7 +19,7 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.sinks.glb import to_glb
-from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, read_motion, to_bvh
+from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, read_motion, to_bvh, to_csv, to_trc
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
@@ -74,6 +75,27 @@ def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotio
     fps, body = read_file("take.bvh", path.read_bytes())
     assert fps == pytest.approx(30.0)
     np.testing.assert_allclose(body, motion.positions[..., [1, 0, 2]] * [1, -1, 1], atol=1e-5)
+
+
+def test_trc_and_csv_are_read_by_pandas(tmp_path: Path, motion: BodyMotion) -> None:
+    path = tmp_path / "take.trc"
+    path.write_bytes(to_trc(motion))
+    head = pandas.read_csv(path, sep="\t", skiprows=1, nrows=1)
+    assert head[["DataRate", "NumFrames", "NumMarkers", "Units"]].iloc[0].tolist() == [30, FRAMES, 22, "mm"]
+    markers = pandas.read_csv(path, sep="\t", skiprows=3, nrows=1, header=None).iloc[0, 2:].dropna()
+    assert markers.tolist() == list(JOINTS)
+    table = pandas.read_csv(path, sep="\t", skiprows=6, header=None).to_numpy()
+    np.testing.assert_allclose(table[:, 1], np.arange(FRAMES) / 30, atol=1e-6)
+    np.testing.assert_allclose(table[:, 2:].reshape(FRAMES, 22, 3), 1000 * motion.positions @ Y_UP.T, atol=1e-3)
+
+    path = tmp_path / "take.csv"
+    path.write_bytes(to_csv(motion))
+    table = pandas.read_csv(path, comment="#")
+    np.testing.assert_allclose(table["stamp"], motion.start_s + np.arange(FRAMES) / 30, atol=1e-6)
+    for k, joint in enumerate(JOINTS):
+        found = table[[f"{joint}_{part}" for part in ("x", "y", "z", "qx", "qy", "qz", "qw")]].to_numpy()
+        np.testing.assert_allclose(found[:, :3], motion.positions[:, k], atol=1e-5)
+        np.testing.assert_allclose(found[:, 3:], motion.rotations[:, k], atol=1e-5)
 
 
 def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, motion: BodyMotion) -> None:

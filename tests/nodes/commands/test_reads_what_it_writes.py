@@ -66,6 +66,15 @@ def test_it_is_completed_where_it_was_imputed(cleaned: Path, name: str, tmp_path
 
 
 @pytest.mark.slow
+def test_it_is_fitted(cleaned: Path, tmp_path: Path) -> None:
+    assert main(["fit", str(cleaned / "walk.npz"), str(tmp_path / "fitted.npz")]) == 0
+    with np.load(tmp_path / "fitted.npz") as fitted, np.load(cleaned / "walk.npz") as out:
+        off = np.linalg.norm(fitted["world_positions"] - out["world_positions"], axis=-1)
+        assert np.median(off) < 0.05
+        assert not fitted["anomaly_flag"].any()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["walk", "walk.npz", "walk.csv"])
 def test_it_is_drawn(cleaned: Path, name: str, tmp_path: Path) -> None:
     assert main(["plot", str(cleaned / name), "-o", str(tmp_path / "picture.png")]) == 0

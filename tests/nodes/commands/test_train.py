@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from steadypose.nodes.cli import main
 from steadypose.nodes.commands import train as command
 from steadypose.nodes.settings import LaunchError
 from steadypose.training import weights as training_weights
@@ -79,3 +80,11 @@ def test_little_is_said_and_next_to_nothing_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(LaunchError, match=r"has 0\.2 minutes of motion .* expected 30 or more; prepare more"):
         command.little_data(path, "default")
+
+
+def test_too_little_is_refused_before_anything_is_trained(shipped: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("steadypose.training.recipes.hmvae.train_hmvae", lambda options: pytest.fail("it was trained"))
+    path = prepared(tmp_path / "c.npz", 0.2)
+    assert main(["train", "hmvae", "--data", str(path), "--runs", str(tmp_path / "runs")]) == 2
+    assert "has 0.2 minutes of motion to train the 'default' weights on: expected 30" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()

@@ -15,9 +15,10 @@ from conftest import repeated, running
 from numpy.typing import NDArray
 
 from steadypose import PACKAGE
-from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.recording import RecordingWriter
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import CONTACTS, PoseWorld
+from steadypose.msgs.types import CONTACTS, Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.graph.launch import Launch, bundled
 from steadypose.nodes.settings import LaunchError
@@ -25,6 +26,7 @@ from steadypose.prior.sim.streams import make, read_manifest
 
 pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
 
+from steadypose.benchmarks.systems.retarget import faults
 from steadypose.nodes.sinks.datagrams import GONE_NS
 from steadypose.nodes.sinks.retarget import EASE_S, SIDES, Follower, Retargeter, RetargetNode, RobotPose
 from steadypose.nodes.sinks.robot import Robot, load_robot
@@ -185,6 +187,33 @@ def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
     assert len(said["joints"]) == 29
     assert len(said["root"]) == 7
     assert set(said["stands"]) == {"left", "right"}
+
+
+def test_the_command_follows_the_cleaned_poses_and_not_the_truth_beside_them(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "in") as writer:
+        for world in worlds("idle")[:20]:
+            body = RawBody(1, world.bodies[0].positions, np.ones(22))
+            raw = PoseRaw(world.stamp_ns, "world", "test", "smpl22", Pose.identity(), True, [body])
+            writer.write(POSE_RAW, raw, raw.stamp_ns)
+            elsewhere = replace(world.bodies[0], positions=world.bodies[0].positions + [50.0, 0, 0])
+            writer.write(POSE_TRUTH, replace(world, bodies=[elsewhere]), raw.stamp_ns)
+    assert main(["retarget", str(tmp_path / "in"), str(tmp_path / "out.npz"), "--urdf", str(URDF)]) == 0
+    with np.load(tmp_path / "out.npz") as found:
+        assert found["root"][:, 0].max() < 20.0
+
+
+def test_the_study_finds_a_breach_a_joint_too_fast_and_a_foot_that_slides(robot: Robot) -> None:
+    still = np.clip(np.zeros(29), robot.lower, robot.upper)
+    knee = robot.joints.index("left_knee_joint")
+    begun, moved, lifted = (RobotPose(k * 33_333_333, np.eye(7)[6], still.copy(), (True, k < 2)) for k in range(3))
+    assert faults(robot, [begun, moved, lifted]) == {"breach_rad": 0.0, "speed": 0.0, "foot_mm": 0.0}
+    moved.root[0] = 0.05
+    lifted.root[1] = 3.0
+    lifted.joints[knee] = robot.upper[knee] + 0.1
+    found = faults(robot, [begun, moved, lifted._replace(stands=(False, False))])
+    assert found["breach_rad"] == pytest.approx(0.1)
+    assert found["speed"] > 1.0
+    assert found["foot_mm"] == pytest.approx(50.0)
 
 
 def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.helpers.bvh_writer import Joint, write_bvh
 
+from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.rigs import UNITS, RigError, Tree, mirror_names, recognise, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_POSITIONS, J
 from steadypose.prior.mocap.clip import MotionError
@@ -172,6 +175,57 @@ def test_a_family_is_read_without_a_word(family: Family) -> None:
     assert (np.diff(heights) > 0).all()
     # In the world, too: on its feet, where the file has it.
     assert body[-1, J["left_hip"], 2] == pytest.approx(HIPS_HEIGHT - family.middle[0][1] / 100, abs=1e-3)
+
+
+def test_cmus_conversion_is_read_with_the_bones_that_it_lost() -> None:
+    """It has no thorax (14 cm here), so neck and arms hang too low; and a hand bone without the wrist's third."""
+    middle = {"Hips": 0.06, "LowerBack": 0.06, "Spine": 0.16, "Spine1": 0.30, "Neck": 0.30, "Neck1": 0.39, "Head": 0.48}
+    heights = list(middle.items())
+    parts = [(name, heights[k - 1][0] if k else None, (0.0, y, 0.0)) for k, (name, y) in enumerate(heights)]
+    for side, sign in (("Left", 1), ("Right", -1)):
+        leg = [
+            (f"{side}{name}", point)
+            for name, point in zip(("UpLeg", "Leg", "Foot", "ToeBase"), LEG.values(), strict=True)
+        ]
+        arm = [("Shoulder", (0, 0.30, 0)), ("Arm", (0.18, 0.375, 0)), ("ForeArm", (0.46, 0.375, 0))]
+        arm += [("Hand", (0.46 + 0.25 / 1.5, 0.375, 0)), ("FingerBase", (0.46 + 0.25 / 1.5, 0.375, 0))]
+        for trunk, limb in (("Hips", leg), ("Spine1", [(f"{side}{name}", point) for name, point in arm])):
+            parents = [trunk, *(name for name, _ in limb)]
+            parts += [(name, parents[k], (sign * x, y, z)) for k, (name, (x, y, z)) in enumerate(limb)]
+    unit = UNITS["CMU"]
+    joints = [Joint(name, parent, np.array(at) / unit) for name, parent, at in parts]
+    joints = [replace(j, end=j.at + np.array([0, 0.18, 0]) / unit) if j.name == "Head" else j for j in joints]
+    fps, body = read_motion("02_01.bvh", write_bvh(joints, np.array([0.0, HIPS_HEIGHT, 0.0]) / unit, 120.0))
+    assert fps == pytest.approx(120.0, rel=1e-4)
+    found = body[-1] - body[-1, [J["left_hip"], J["right_hip"]]].mean(axis=0)
+    for part, x, z in (
+        ("shoulder", 0.18, 0.515),
+        ("elbow", 0.46, 0.515),
+        ("wrist", 0.71, 0.515),
+        ("knee", 0.09, -0.42),
+    ):
+        for side, sign in (("left", 1), ("right", -1)):
+            np.testing.assert_allclose(found[J[f"{side}_{part}"]][[0, 2]], [sign * x, z], atol=1e-4, err_msg=part)
+    np.testing.assert_allclose(
+        found[[J["spine3"], J["neck"], J["head"]], 2], [0.30, 0.53, 0.62 + 0.2 * 0.18], atol=1e-4
+    )
+
+
+def test_an_npz_of_smpl_x_is_read_without_a_body_model(tmp_path: Path) -> None:
+    """Its names, with hands and face in `poses`, and the frame rate under the name that SMPL-X' files give it."""
+    poses, trans = np.zeros((4, 165)), np.tile([1.0, 2.0, 0.9], (4, 1))
+    poses[:, 0] = np.pi / 2  # from y up to z up
+    np.savez(
+        tmp_path / "stageii.npz", poses=poses, trans=trans, mocap_frame_rate=np.array(120.0), betas=np.zeros(16),
+        gender=np.array("neutral"), surface_model_type=np.array("smplx"),
+    )  # fmt: skip
+    source = open_recording(tmp_path / "stageii.npz")
+    raws = [message for _, message in source if isinstance(message, PoseRaw)]
+    assert np.diff([raw.stamp_ns for raw in raws]) == pytest.approx(1e9 / 120, abs=1)
+    joints = raws[-1].bodies[0].positions
+    np.testing.assert_allclose(joints[0], [1.0, 2.0, 0.9], atol=1e-6)
+    assert joints[J["head"], 2] > joints[J["neck"], 2] > 1.2
+    assert joints[J["left_foot"], 2] < joints[J["left_knee"], 2] < 0.7
 
 
 def test_a_body_of_canonical_names_is_taken_as_it_is() -> None:
