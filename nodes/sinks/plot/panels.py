@@ -15,6 +15,7 @@ from steadypose.nodes.sinks.drawing import (
     ALL_BONES,
     CLEAN_COLOUR,
     CONTACT_INDICES,
+    FAINT,
     RAW_COLOUR,
     STATE_COLOURS,
     TRUTH_COLOUR,
@@ -216,12 +217,14 @@ CONTACT_PROBABILITY = 0.5
 
 
 def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
-    """Draw stick figures at regular times, seen from the front, with the input behind the output."""
+    """Draw stick figures at regular times, seen from the front, with the input behind the output; bones to joints that
+    the sensor lacks are faint."""
     clean = history.track(POSE_CLEAN, body)
     track = next(
         t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if (t := history.track(topic, body)) is not None
     )
     raw_bones = bones(history.observable)
+    opacity = np.where(history.observable[ALL_BONES].all(axis=1), 1.0, FAINT)
     chosen = np.linspace(0, len(track.time) - 1, min(FIGURES, len(track.time))).round().astype(int)
     if clean is None:
         (figures,) = side_by_side(ax, track.time[chosen], track.positions[chosen])
@@ -232,7 +235,7 @@ def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
     for row, points, raw in zip(chosen, figures, behind, strict=True):
         draw_bones(ax, raw, raw_bones, RAW_COLOUR, width=5.0, alpha=0.55)
         colours = [STATE_COLOURS[JointState(state)] for state in bone_states(clean.state[row])]
-        draw_bones(ax, points, ALL_BONES, colours, width=2.0)
+        draw_bones(ax, points, ALL_BONES, colours, width=2.0, alpha=opacity)
 
 
 def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> list[Floats]:
