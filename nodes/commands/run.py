@@ -20,7 +20,7 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.output import printable
-from steadypose.nodes.commands.run_table import line, table
+from steadypose.nodes.commands.run_table import lines, table
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch, in_launch_file
@@ -251,7 +251,8 @@ class _Run:
                 live.update(table(self._launch.nodes, self._diagnostics, supervisor, self._console.width), refresh=True)
         elif self._clock.monotonic_ns() - self._printed_ns >= LINE_NS:
             self._printed_ns = self._clock.monotonic_ns()
-            self._print(line(self._launch.nodes, self._diagnostics, supervisor))
+            for text in lines(self._launch.nodes, self._diagnostics, supervisor):
+                self._print(text)
 
     def _exit_status(self, supervisor: Supervisor) -> int | None:
         """The exit status, or None while there is something to wait for."""

@@ -15,6 +15,8 @@ from steadypose.nodes.graph.topology import NODES
 
 LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
 """of the table's columns: the first to go where they do not fit"""
+WIDTH = 80
+"""of `lines`, characters"""
 
 
 def table(
@@ -79,8 +81,8 @@ def table(
     return Group(grid, *notes)
 
 
-def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor) -> str:
-    """The gist of `table` in one line."""
+def lines(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor) -> list[str]:
+    """The gist of `table`: as few lines as fit into `WIDTH` characters, of which all but the first are indented."""
     parts = []
     for name in nodes:
         values = diagnostics[name].values if name in diagnostics else {}
@@ -98,7 +100,11 @@ def line(nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supe
             + (f", {trouble[0]} dropped, {trouble[1]} refused" if any(trouble) else "")
             + problems
         )
-    return " | ".join(parts)
+    found = [parts[0]]
+    for part in parts[1:]:
+        fits = len(found[-1]) + 3 + len(part) <= WIDTH
+        found[-1:] = [f"{found[-1]} | {part}"] if fits else [found[-1], f"  {part}"]
+    return found
 
 
 def _state(process: str, values: dict[str, str]) -> str:

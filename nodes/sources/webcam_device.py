@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,6 +22,8 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET: what cannot be read is said by ourselves
 
 Landmarker = Callable[[NDArray[Any], int], Any]
 """Function from an RGB image (H, W, 3) and its time in increasing milliseconds to a ``PoseLandmarkerResult``."""
@@ -140,8 +144,31 @@ def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
     Raises:
         LaunchError: the model cannot be used, or MediaPipe has no built-in one.
     """
-    with _landmarker_of(settings) if settings.model else _own_landmarker() as landmarker:
-        yield landmarker
+    with ExitStack() as stack:
+        with _silent():
+            landmarker = stack.enter_context(_landmarker_of(settings) if settings.model else _own_landmarker())
+        calls = count()
+
+        def find(image: NDArray[Any], milliseconds: int) -> Any:
+            with nullcontext() if next(calls) else _silent():
+                return landmarker(image, milliseconds)
+
+        yield find
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Discard what libraries write to standard error: MediaPipe logs at its start and at the first image, and has no
+    setting for it. Exceptions pass.
+    """
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nothing, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 @contextmanager

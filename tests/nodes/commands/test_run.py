@@ -12,7 +12,7 @@ from rich.console import Console
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level
-from steadypose.nodes.commands.run import STALL_NS, _Run, line, table
+from steadypose.nodes.commands.run import STALL_NS, _Run, lines, table
 from steadypose.nodes.graph import supervisor
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import RUN
@@ -224,8 +224,11 @@ def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
     for text in ("30.0", "3.1/9.9", "133", "unknown_skeleton 5", "flagged", "starting"):
         assert text in shown(latest, 140)
     assert "restarts" not in shown(latest, 140), "nothing to say there"
-    printed = line(NODES, latest, Processes(*NODES))  # type: ignore[arg-type]
-    assert "pose/clean 30.0 Hz, latency p50/p99 3.1/9.9 ms, 0 dropped, 5 refused" in printed
+    printed = lines(NODES, latest, Processes(*NODES))  # type: ignore[arg-type]
+    assert any("pose/clean 30.0 Hz, latency p50/p99 3.1/9.9 ms, 0 dropped, 5 refused" in line for line in printed)
+    assert len(printed) > 1
+    assert max(map(len, printed)) <= 80
+    assert all(line.startswith("  ") for line in printed[1:])
 
 
 def test_the_table_leaves_out_what_does_not_fit_into_a_terminal() -> None:
@@ -246,7 +249,7 @@ def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Laun
     processes: Supervisor = Processes("prior")  # type: ignore[assignment]
     for _ in range(2):
         run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"), processes)
-    assert "stamps_zero" in line(["prior"], run._diagnostics, processes)
+    assert "stamps_zero" in lines(["prior"], run._diagnostics, processes)[0]
     run._receive(news("prior"), processes)
     assert console.export_text().splitlines() == [
         "prior: ERROR: stamp is 0: expected more [stamps_zero]",

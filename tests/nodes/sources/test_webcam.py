@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -100,6 +102,32 @@ def test_each_image_gives_the_bodies_in_it(video: Path, model: str) -> None:
     colours, milliseconds = zip(*seen.images, strict=True)
     assert [int(colour[2]) > int(colour[0]) for colour in colours[2:]] == [True] * 3, "RGB, not OpenCV's BGR"
     assert list(milliseconds) == sorted(set(milliseconds)), "MediaPipe wants them to rise"
+
+
+def test_a_broken_video_gives_the_error_alone(tmp_path: Path) -> None:
+    """In a process of its own, because FFmpeg reads its level once."""
+    (tmp_path / "broken.mp4").write_bytes(b"\0\0\0 ftypisom\0\0\2\0isomiso2avc1mp41" + bytes(500))
+    code = """if True:
+        import sys
+        from steadypose.nodes.sources.webcam_device import CalibrationSettings, VideoSource, WebcamSettings
+        try:
+            VideoSource(WebcamSettings(video=sys.argv[1]), CalibrationSettings())
+        except ValueError as error:
+            print(error)
+    """
+    command = [sys.executable, "-c", code, str(tmp_path / "broken.mp4")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "expected a video that OpenCV can read" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.slow
+def test_mediapipe_says_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mediapipe.python.solutions.pose", reason="the extra 'webcam' is not installed, or a newer one")
+    with webcam_device.mediapipe_landmarker(WebcamSettings()) as landmarker:
+        for milliseconds in (0, 33):
+            landmarker(np.zeros((240, 320, 3), np.uint8), milliseconds)
+    assert capfd.readouterr().err == ""
 
 
 def test_an_image_that_fails_is_counted_and_the_next_one_comes(video: Path, model: str) -> None:
