@@ -58,6 +58,13 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
         ) for row, method in (("completer, L2Q; L2P", "completer"), ("natural cubic spline", "cubic spline"))
     ),
     (
+        "docs/retarget.md",
+        r"a frame takes (\S+) ms of processor time \(p99 (\S+)\), joints leave their range by (\S+) rad, and a "
+        r"standing foot slips by up to (\S+) mm",
+        [("retarget", "retarget", "all", column) for column in (
+            "cpu, p50, ms", "cpu, p99, ms", "worst breach of a range, rad", "standing foot, at most, mm")],
+    ),
+    (
         "docs/complete.md",
         r"keeps (\S+) to (\S+) times the true acceleration, instead of (\S+) to (\S+)\.",
         [("interpolation", "interpolation-search", f"{method}, {gap}", "acceleration, of the true")
