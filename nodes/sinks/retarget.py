@@ -107,6 +107,8 @@ RELEASE_S = 0.15
 """Time in which a lifting foot moves from where it stood to its target, seconds."""
 STANDS, LIFTS = 0.6, 0.4
 """Contact probabilities above which a foot stands, and below which it lifts."""
+ROOT_M_S, ROOT_RAD_S = 4.0, 4.0
+"""Largest speeds of the root link. A faster step is shortened as a whole, so that it keeps its direction."""
 TOO_FAR = 0.3
 """Distance between a standing foot and its target at which it is released anyway, metres."""
 MARGIN = 1e-4
@@ -203,7 +205,9 @@ class Retargeter:
             wanted = self._mink.solve_ik(
                 self._configuration, list(self._tasks.values()), dt, "daqp", damping=1e-4, limits=self._limits
             )
-            self._velocity = share * wanted
+            # the program is linear: a large step of the root, which has no limits there, would tear off standing feet
+            root = max(np.linalg.norm(wanted[:3]) / ROOT_M_S, np.linalg.norm(wanted[3:6]) / ROOT_RAD_S, 1.0)
+            self._velocity = share / root * wanted
             self._integrate(dt)
         return self._pose(stamp_ns)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import repeated, running
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingWriter
@@ -28,7 +29,16 @@ pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
 
 from steadypose.benchmarks.systems.retarget import faults
 from steadypose.nodes.sinks.datagrams import GONE_NS
-from steadypose.nodes.sinks.retarget import EASE_S, SIDES, Follower, Retargeter, RetargetNode, RobotPose
+from steadypose.nodes.sinks.retarget import (
+    EASE_S,
+    ROOT_M_S,
+    ROOT_RAD_S,
+    SIDES,
+    Follower,
+    Retargeter,
+    RetargetNode,
+    RobotPose,
+)
 from steadypose.nodes.sinks.robot import Robot, load_robot
 
 URDF = PACKAGE / "launch" / "robots" / "humanoid29.urdf"
@@ -89,6 +99,21 @@ def test_a_raised_hand_is_raised_and_a_sitting_person_sits(robot: Robot) -> None
         lowest = min(lowest, float(retargeter._frame("pelvis")[1][2]))
     assert raised > 0.05
     assert lowest < 0.55
+
+
+def test_a_jump_of_the_estimate_moves_the_root_no_faster_than_a_person_runs(robot: Robot) -> None:
+    stream = worlds("idle")[:60]
+    for world in stream[50:]:
+        body = world.bodies[0]
+        turned = body.positions * [-1.0, -1.0, 1.0]  # by half a turn about the middle of the room
+        rotations = body.rotations.copy()
+        rotations[0] = (Rotation.from_euler("z", np.pi) * Rotation.from_quat(rotations[0])).as_quat()
+        world.bodies[0] = replace(body, positions=turned, rotations=rotations)
+    worlds.cache_clear()
+    roots = np.array([pose.root for pose in followed(robot, stream)[0]])
+    assert np.linalg.norm(np.diff(roots[:, :3], axis=0), axis=1).max() / FRAME_S < 1.01 * ROOT_M_S
+    turns = Rotation.from_quat(roots[:-1, 3:]).inv() * Rotation.from_quat(roots[1:, 3:])
+    assert turns.magnitude().max() / FRAME_S < 1.01 * ROOT_RAD_S
 
 
 def test_it_begins_and_stops_smoothly(robot: Robot) -> None:
