@@ -32,7 +32,7 @@ def test_noise_has_the_size_and_the_memory_that_it_says() -> None:
         assert (noise[1:] * noise[:-1]).mean() / noise.var() == pytest.approx(memory, abs=0.02)
 
 
-def test_one_sighting_in_a_hundred_lies_thirty_centimetres_off() -> None:
+def test_one_observation_in_a_hundred_lies_thirty_centimetres_off() -> None:
     off = np.linalg.norm(spiked(np.zeros(SHAPE), np.random.default_rng(0)), axis=-1)
     assert (off > 0).mean() == pytest.approx(0.01, rel=0.15)
     np.testing.assert_allclose(off[off > 0], 0.30)

@@ -79,7 +79,7 @@ class Bank(NamedTuple):
         velocity: (S, J, M, 3) m/s, and ``velocity_variance`` (S, J, M).
         squared_innovations: (S, J, M) sums, with forgetting, of the squared innovations normalised by their variance.
         log_variances: (S, J, M) sums, with forgetting, of the logarithms of the innovations' variance.
-        sightings: (S, J) number of observations in these sums, with forgetting.
+        observations: (S, J) number of observations in these sums, with forgetting.
         raw: (S, J, K, 3) metres, the raw position, or the last one while unobserved; NaN before the first.
         unseen: (S, J, K) frames since the joint was last observed; -1 before the first observation.
         confidence: (S, J, K) confidence of the observation.
@@ -105,7 +105,7 @@ class Bank(NamedTuple):
     velocity_variance: NDArray[np.float64]
     squared_innovations: NDArray[np.float64]
     log_variances: NDArray[np.float64]
-    sightings: NDArray[np.float64]
+    observations: NDArray[np.float64]
     raw: NDArray[np.float64]
     unseen: NDArray[np.float64]
     confidence: NDArray[np.float64]
@@ -135,7 +135,7 @@ def new_bank(bodies: int, delay: int) -> Bank:
         velocity_variance=np.empty((bodies, joints, experts)),
         squared_innovations=np.empty((bodies, joints, experts)),
         log_variances=np.empty((bodies, joints, experts)),
-        sightings=np.empty((bodies, joints)),
+        observations=np.empty((bodies, joints)),
         raw=np.empty((bodies, joints, frames, 3)),
         unseen=np.empty((bodies, joints, frames)),
         confidence=np.empty((bodies, joints, frames)),
@@ -229,7 +229,7 @@ def _change_body(bank, s, members, covariance):
     turn(bank.velocity_variance[s], squared)
     turn(bank.squared_innovations[s], squared)
     turn(bank.log_variances[s], squared)
-    turn(bank.sightings[s].reshape(joints, -1), squared)
+    turn(bank.observations[s].reshape(joints, -1), squared)
 
 
 @njit(cache=True)
@@ -255,7 +255,7 @@ def _track(bank, s, slot, last, step, positions, confidence, seen, known, member
                 bank.velocity[s, t], bank.velocity_variance[s, t], slot, last, step, bank.eigenvalue[s, t] * densities,
             )  # fmt: skip
             if updated[t]:
-                bank.sightings[s, t] = (1.0 - 1.0 / MEMORY) * bank.sightings[s, t] + 1.0
+                bank.observations[s, t] = (1.0 - 1.0 / MEMORY) * bank.observations[s, t] + 1.0
     for m in range(len(densities)):
         for t in range(joints):
             for axis in range(3):
@@ -295,13 +295,13 @@ def _measure_differences(recent, sizes, age):
 
 
 @njit(cache=True)
-def multiple_model_weights(squared_innovations, log_variances, sightings, expected, counts, weights):
+def multiple_model_weights(squared_innovations, log_variances, observations, expected, counts, weights):
     """Write the smoothers' weights in the multiple-model estimate of one track: their normalised likelihoods.
 
     Args:
         squared_innovations: (M,) sums of one track, see `Bank`.
         log_variances: (M,) sums of one track, see `Bank`.
-        sightings: number of observations in these sums.
+        observations: number of observations in these sums.
         expected: variance of the measurement noise in the other tracks, in units of `MEASUREMENT_SIGMA` squared.
         counts: weight of ``expected``, observations.
         weights: (M,), written; they sum to 1.
@@ -309,7 +309,7 @@ def multiple_model_weights(squared_innovations, log_variances, sightings, expect
     Returns:
         The estimated variance of the measurement noise, in the same units.
     """
-    most, noise, total = -np.inf, 0.0, sightings + counts
+    most, noise, total = -np.inf, 0.0, observations + counts
     for m in range(len(weights)):
         scale = (squared_innovations[m] + counts * expected) / total if total > 0.0 else 1.0
         weights[m] = -1.5 * (total * np.log(scale) + log_variances[m])

@@ -46,8 +46,8 @@ _SIZES = 2 * _VECTORS
 _BONE = _SIZES + len(LAGS)
 _POSE = _BONE + 6
 _MULTIPLE_MODEL = _POSE + 6
-_SIGHTING = _MULTIPLE_MODEL + 6
-_DELAY = _SIGHTING + 6
+_OBSERVED = _MULTIPLE_MODEL + 6
+_DELAY = _OBSERVED + 6
 """Offsets of the groups of features. The groups are: three log-distances for each pair of neighbouring experts (the
 smoothers by density, then the raw joint), vectors between these experts, sizes of differences, bone, pose,
 multiple-model estimate, observation, and delay."""
@@ -104,7 +104,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
         total, seen_joints = 0.0, 0.0
         _write_experts(
             bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
-            bank.sightings[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness[s], experts[s],
+            bank.observations[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness[s], experts[s],
             weights, noise,
         )  # fmt: skip
         for j in range(joints):
@@ -113,7 +113,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
                 for since in range(1, back + 1):
                     if bank.unseen[s, j, (slot + since) % frames] == 0.0:
                         gap[s, j] = min(gap[s, j], since)
-                        scales = bank.squared_innovations[s, j] / max(bank.sightings[s, j], 1.0)
+                        scales = bank.squared_innovations[s, j] / max(bank.observations[s, j], 1.0)
                         between[s, j] = _deviation(experts[s, j], weights[j], bank.variance[s, j, :, slot], scales)
                         break
             if gap[s, j] == 0.0:
@@ -136,7 +136,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
         unseen = bank.unseen[s, :, slot]
         for j in range(joints):
             confidence, age = bank.confidence[s, j, slot], bank.age[s, j]
-            _describe_sighting(unseen[j], gap[s, j], confidence, age[0], back, scale[s], features[s, j])
+            _describe_observation(unseen[j], gap[s, j], confidence, age[0], back, scale[s], features[s, j])
             if unseen[j] >= 0.0:
                 heading = bank.heading[s]
                 _describe_experts(experts[s, j], bank.distances[s, j], heading, scale[s], features[s, j])
@@ -154,7 +154,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
 
 @njit(cache=True)
 def _write_experts(
-    tracks, modes, squared_innovations, log_variances, sightings, raw, unseen, shared, experts, weights, noise
+    tracks, modes, squared_innovations, log_variances, observations, raw, unseen, shared, experts, weights, noise
 ):
     """Write the joints' experts (J, EXPERTS, 3), and the tracks' smoother weights (J, M) and noise (J,).
 
@@ -164,15 +164,15 @@ def _write_experts(
     own, found = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     mean, logarithm, tracked = np.zeros((joints, 3)), 0.0, 0
     for t in range(joints):
-        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], sightings[t], 0.0, 0.0, own[t])
-        if sightings[t] > 0.0:
+        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], observations[t], 0.0, 0.0, own[t])
+        if observations[t] > 0.0:
             logarithm += np.log(found[t])
             tracked += 1
     for t in range(joints):
         if shared > 0.0 and tracked > 0:
             expected = np.exp(logarithm / tracked)
             found[t] = multiple_model_weights(
-                squared_innovations[t], log_variances[t], sightings[t], expected, shared, own[t]
+                squared_innovations[t], log_variances[t], observations[t], expected, shared, own[t]
             )
         for m in range(_SMOOTHERS):
             for axis in range(3):
@@ -252,7 +252,7 @@ def _write_vector(heading, x, y, z, unit, features, at):
 
 
 @njit(cache=True)
-def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
+def _describe_observation(unseen, gap, confidence, age, back, scale, features):
     """Observation and delay; sets all other features to 0."""
     for k in range(FEATURES):
         features[k] = 0.0
@@ -261,12 +261,12 @@ def _describe_sighting(unseen, gap, confidence, age, back, scale, features):
     features[_DELAY + len(_DELAYS)] = back / 16.0
     if unseen < 0.0:
         return
-    features[_SIGHTING] = 1.0 if unseen == 0.0 else 0.0
-    features[_SIGHTING + 1] = np.log(1.0 + unseen)
-    features[_SIGHTING + 2] = confidence
-    features[_SIGHTING + 3] = 1.0 / (1.0 + age / 10.0)
-    features[_SIGHTING + 4] = np.log(scale / 0.01)
-    features[_SIGHTING + 5] = np.log(1.0 + gap)
+    features[_OBSERVED] = 1.0 if unseen == 0.0 else 0.0
+    features[_OBSERVED + 1] = np.log(1.0 + unseen)
+    features[_OBSERVED + 2] = confidence
+    features[_OBSERVED + 3] = 1.0 / (1.0 + age / 10.0)
+    features[_OBSERVED + 4] = np.log(scale / 0.01)
+    features[_OBSERVED + 5] = np.log(1.0 + gap)
 
 
 @njit(cache=True)

@@ -32,7 +32,7 @@ def windows(frames: int = 12) -> tuple[np.ndarray, np.ndarray]:
     return deviations, observed
 
 
-def test_the_gap_to_the_nearest_sightings() -> None:
+def test_the_gap_to_the_nearest_observations() -> None:
     deviations, observed = windows()
     observed[0, 0, 7] = 0  # a coordinate alone: the joint was not seen whole
     gap = completion_features(deviations, observed, 0.0, patch=4).gap
@@ -103,7 +103,7 @@ def test_a_guess_is_believed_by_how_good_it_is() -> None:
     np.testing.assert_allclose(found[:, 6:9], 0.25)
 
 
-def test_a_sighting_a_second_ago_is_told_from_none() -> None:
+def test_an_observation_a_second_ago_differs_from_none() -> None:
     observed = np.ones((2, 66, 50))
     observed[0, TRACKS, 1:] = 0
     observed[1, TRACKS] = 0

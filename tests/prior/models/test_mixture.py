@@ -144,7 +144,7 @@ def test_a_joint_that_is_missed_for_long_is_a_track_by_itself_until_it_has_settl
     assert np.flatnonzero(bank.modes[0, 7]).tolist() == [7]
 
 
-def test_the_gap_is_the_time_to_the_nearest_sighting() -> None:
+def test_the_gap_is_the_time_to_the_nearest_observation() -> None:
     seen = walk(12)[:, 0]
     seen[:3, 5] = np.nan
     seen[6:9, 5] = np.nan
@@ -219,7 +219,7 @@ def test_an_unseen_joint_coasts_and_says_so(delay: int) -> None:
     assert sigma[85] > 0.1
 
 
-def test_between_two_sightings_a_joint_is_near_the_truth_and_says_so() -> None:
+def test_between_two_observations_a_joint_is_near_the_truth_and_says_so() -> None:
     truth = walk(pace=1.5)
     seen = noisy(truth, 0.002)
     seen[45:48, :, 20] = np.nan

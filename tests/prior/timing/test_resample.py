@@ -76,7 +76,7 @@ def test_a_slow_camera_is_interpolated_between_its_frames() -> None:
     assert frames[3][1][0, 0, 0] == pytest.approx(3 * PERIOD_NS * 1e-9)
 
 
-def test_the_lesser_confidence_holds_between_two_sightings() -> None:
+def test_the_lesser_confidence_holds_between_two_observations() -> None:
     resampler = Resampler(SLOTS)
     resampler.update(0, line(0), np.full((SLOTS, 22), 0.9))
     frames = resampler.update(3 * PERIOD_NS, line(3 * PERIOD_NS), np.full((SLOTS, 22), 0.2))

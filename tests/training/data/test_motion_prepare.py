@@ -73,7 +73,7 @@ def test_resampling_is_by_time(fps: float, frames: int) -> None:
 
 
 @given(start=st.integers(0, 30), length=st.integers(1, 12))
-def test_only_short_gaps_between_sightings_are_filled(start: int, length: int) -> None:
+def test_only_short_gaps_between_observations_are_filled(start: int, length: int) -> None:
     line = np.arange(31)[:, None, None] * np.array([0.1, 0.2, -0.1]) + np.zeros((1, 2, 1))
     holed = line.copy()
     holed[start : start + length, 1] = np.nan
