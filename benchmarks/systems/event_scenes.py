@@ -199,7 +199,8 @@ def common(person: int, motion: Motion) -> list[Label]:
     hips = motion.root[:, 2]
     tall = -float(motion.offsets[LEG, 2].sum()) + TOE_HEIGHT
     up = hips > 0.5 * tall
-    upright = p[:, J["neck"], 2] - p[:, J["pelvis"], 2] > 0.3
+    trunk = p[:, J["neck"]] - p[:, J["pelvis"]]
+    upright = trunk[:, 2] > 0.5 * np.linalg.norm(trunk, axis=1)
     labels = [
         *_while(person, EventKind.NEAR, Hand.NONE, t, away < s.near - DOUBT, away < s.near + s.near_margin),
         *_while(

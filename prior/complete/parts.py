@@ -13,13 +13,16 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.completer_features import correction_share, draw_line
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, hang_unseen, to_tracks
 from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.weights import WeightsError, load_weights, part
 
 SHARE = 0.8
-"""Share of HG-VAE's completion in the blend (chosen on validation, benchmarks/NOTEBOOK.md)."""
+"""Share of HG-VAE's completion in the blend where a joint is hidden from the start, to the end or throughout. Between
+observations it is proportional to the gap, for the completer is better in short ones (chosen on validation,
+benchmarks/NOTEBOOK.md)."""
 
 SMOOTH = 3.0
 """Standard deviation of the Gaussian that smooths the difference of the two, frames. Hidden limbs in HG-VAE's
@@ -60,7 +63,8 @@ class PartsCompleter:
                 continue  # only gaps, or no root that could be the body's origin
             first = place_joints(rotations[row], bones) + root[row][:, None]
             second = self._second(given, first, bones)
-            joints = first + SHARE * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
+            share = SHARE * correction_share(draw_line(known[None]))[0]
+            joints = first + share * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
             # within a gap, joints that are known in other frames come from the completer alone
             asked = ~known & (partly[:, None] | ~known.any(axis=0))
             some = asked.any(axis=1)

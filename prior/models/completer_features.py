@@ -80,7 +80,7 @@ class CompleterConfig:
 
 
 class Line(NamedTuple):
-    """Interpolation of each track of B windows: 22 rotations and, last, the root's position.
+    """Interpolation of each track of B windows: here 22 rotations and, last, the root's position.
 
     Attributes:
         before: (B, T, 23) index of the last known frame; of the next one if there is none before.
@@ -206,9 +206,8 @@ def draw_line(known: Bools) -> Line:
 
 
 def correction_share(line: Line) -> Floats32:
-    """(B, T, 23, 1) share of the correction that is applied in addition to the cubic.
-
-    It is `SHARE_FRAMES`' share, and 1 if a track is known on one side only or never.
+    """(B, T, K, 1) share of what a network adds to the cubic: that of `SHARE_FRAMES`, and 1 if a track is known on one
+    side only or never.
     """
     length = (line.after - line.before)[..., None]
     return np.where(length > 0, np.minimum(length / SHARE_FRAMES, 1.0), 1.0).astype(np.float32)

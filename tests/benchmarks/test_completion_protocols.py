@@ -90,7 +90,7 @@ def test_both_protocols_run_without_any_data(tmp_path: Path, monkeypatch) -> Non
         bench = Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress)
         between, parts = interpolation.run(bench), completion.run(bench)
     assert [table.name for table in between.tables] == ["interpolation", "interpolation-search"]
-    assert len(between.tables[0].rows) == 2 * 6
+    assert len(between.tables[0].rows) == 2 * 8
     assert [row[:2] for row in between.tables[1].rows[2:]] == [
         ["HM-VAE searched from there", "15"], ["HM-VAE searched from random latents", "15"]
     ]  # fmt: skip

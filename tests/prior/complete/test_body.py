@@ -10,6 +10,7 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.complete import parts
 from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
@@ -105,6 +106,28 @@ def test_a_second_opinion_counts_where_a_part_is_hidden_and_nowhere_else() -> No
     known = np.isfinite(seen).all(axis=-1)
     placed = place_joints(rotations[0], REST_OFFSETS) + root[0][:, None]
     assert np.abs(placed - positions)[known].max() < 0.01
+
+
+@pytest.mark.parametrize(("frames", "share"), [(8, 0.8 * 9 / 75), (30, 0.8 * 31 / 75)])
+def test_a_second_opinion_counts_less_in_a_short_gap(frames: int, share: float, monkeypatch) -> None:
+    """In a gap of n frames between observations n + 1 apart, it has the (n + 1) / 75th of its share."""
+    positions, hidden = waving(100), (slice(40, 40 + frames), [J["left_knee"], J["left_ankle"], J["left_foot"]])
+    seen = positions.copy()
+    seen[hidden] = np.nan
+    completer = LiveCompleter.load("default")
+    both = PartsCompleter(completer)
+    monkeypatch.setattr(parts, "gaussian_filter1d", lambda values, *_, **__: values)
+    monkeypatch.setattr(parts, "fit_lengths", lambda joints, *_: joints)
+    monkeypatch.setattr(both, "_second", lambda given, first, bones: first + 0.1)
+    given: list[np.ndarray] = []
+    solve = parts.solve_rotations
+    monkeypatch.setattr(
+        parts, "solve_rotations", lambda joints, *others: given.append(joints) or solve(joints, *others)
+    )
+    rotations, root = completer(seen[None], REST_OFFSETS[None])
+    alone = place_joints(rotations[0], REST_OFFSETS) + root[0][:, None]
+    both(seen[None], REST_OFFSETS[None])
+    np.testing.assert_allclose(given[0][:, hidden[1]] - alone[hidden], 0.1 * share, atol=1e-6)
 
 
 def test_what_is_far_from_all_that_is_known_is_not_made_up() -> None:
