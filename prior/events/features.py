@@ -30,8 +30,9 @@ HIPS, SHOULDERS = (
 NARROW = 0.05
 """Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
 
-ANKLE, LEG_SIGMA = 0.07, 0.05
-"""Height of a standing adult's ankle over the floor, and standard deviation of an unobserved leg's length, metres."""
+ANKLE, LEG_SIGMA, TRUNK_SIGMA = 0.07, 0.05, 0.05
+"""Height of a standing adult's ankle over the floor, and standard deviations of an unobserved leg's length and of
+unobserved hips' height under the neck, metres."""
 
 ANKLES = [J["left_ankle"], J["right_ankle"]]
 ANKLE_CONTACTS = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
@@ -114,7 +115,10 @@ def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.n
     extension = Quantity((hips[2] - p[ankle][2]) / leg, math.hypot(s[J["pelvis"]], s[ankle]) / leg)
     thigh = min((_thigh(p, s, side) for side in ("left", "right")), key=lambda q: _last_if_nan(q.value))
     if np.isnan(body.contacts[ANKLE_CONTACTS]).all() and not any(observed[joint] for joint in ANKLES):
-        extension, thigh = _from_height(p, hips[2] - floor - ANKLE, leg, s[J["pelvis"]])
+        neck, pelvis = J["neck"], J["pelvis"]
+        # a guess's deviation is mostly horizontal: that of hips under an observed neck is the trunk's lean and length
+        below = math.hypot(s[neck], TRUNK_SIGMA) if observed[neck] and not observed[pelvis] else math.inf
+        extension, thigh = _from_height(p, hips[2] - floor - ANKLE, leg, min(s[pelvis], below))
     heights = sorted((p[joint][2], joint) for joint in EXTENT if not math.isnan(p[joint][2]))
     if len(heights) > len(EXTENT) // 2:
         (low, lowest), (high, highest) = heights[0], heights[-1]

@@ -126,19 +126,23 @@ def test_a_pose_begins_one_event_within_a_third_of_a_second_and_ends_it(
     assert 40 < ends <= 45
 
 
-@pytest.mark.parametrize(("calibrated", "height"), [(True, 0.0), (True, 0.6), (False, 0.0)])
+@pytest.mark.parametrize(
+    ("calibrated", "height", "hips"), [(True, 0.0, True), (True, 0.6, True), (False, 0.0, True), (True, 0.0, False)]
+)
 def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits(
-    calibrated: bool, height: float
+    calibrated: bool, height: float, hips: bool
 ) -> None:
-    """Legs are guessed to stand, always; a floor that is lower or unknown changes what is known of them."""
-    guessed = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    """Legs are guessed to stand, always; a floor that is lower or unknown changes what is known of them. Hips that are
+    hidden too are known by the neck, although their place is 20 cm uncertain."""
+    legs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    guessed = legs if hips else [*legs, J["pelvis"], J["left_hip"], J["right_hip"]]
     detector, found = EventDetector(), []
     for index, pose in enumerate([*STILL, *[sitting()] * 20, *STILL]):
-        seen, hips = pose.copy(), pose[[J["left_hip"], J["right_hip"]]].mean(axis=0)
-        seen[guessed] = (standing() - standing()[J["pelvis"]])[guessed] + hips
+        seen, middle = pose.copy(), pose[[J["left_hip"], J["right_hip"]]].mean(axis=0)
+        seen[legs] = (standing() - standing()[J["pelvis"]])[legs] + middle
         world = message(index, seen + [0.0, 0.0, height])
         body = world.bodies[0]
-        body.state[guessed], body.contacts[:6] = JointState.IMPUTED, np.nan
+        body.state[guessed], body.sigma[guessed], body.contacts[:6] = JointState.IMPUTED, 0.2, np.nan
         world.ground_plane[3] = -height
         found += [(index, event.kind, event.hand, event.phase) for event in
                   detector.update(world, calibrated=calibrated) if event.phase != Phase.HOLDS]  # fmt: skip
