@@ -55,7 +55,9 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
             rf"\| {row} " + r"\| (\S+); (\S+) " * len(GAPS) + r"\|",
             [("interpolation", "interpolation", f"{method}, {gap}", column)
              for gap in GAPS for column in ("of slerp's", "of lerp's")],
-        ) for row, method in (("completer, L2Q; L2P", "completer"), ("natural cubic spline", "cubic spline"))
+        ) for row, method in (
+            ("completer, L2Q; L2P", "completer"), ("natural cubic spline", "cubic spline, joints given")
+        )
     ),
     (
         "docs/retarget.md",
