@@ -164,7 +164,7 @@ def _numpy(values: Tensor) -> Floats:
     return values.detach().double().numpy()
 
 
-def _joined(done: Sequence[dict[str, Floats]], bounds: Sequence[tuple[int, int]]) -> FittedTrack:
+def _joined(done: Sequence[dict[str, Any]], bounds: Sequence[tuple[int, int]]) -> FittedTrack:
     """Join all windows to one motion, cross-faded where two overlap."""
     whole = {name: values for name, values in done[0].items() if name in ("joints", "rotations", "load", "misfit")}
     for (_, end), (first, _), found in zip(bounds, bounds[1:], done[1:], strict=False):
