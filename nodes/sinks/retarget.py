@@ -109,6 +109,9 @@ STANDS, LIFTS = 0.6, 0.4
 """Contact probabilities above which a foot stands, and below which it lifts."""
 ROOT_M_S, ROOT_RAD_S = 4.0, 4.0
 """Largest speeds of the root link. A faster step is shortened as a whole, so that it keeps its direction."""
+LANDED = 0.01
+"""Distance from where it is held within which a foot has landed and is published as standing, metres. A person's
+contact probability rises before the robot's foot, of other proportions, is on the floor."""
 TOO_FAR = 0.3
 """Distance between a standing foot and its target at which it is released anyway, metres."""
 MARGIN = 1e-4
@@ -124,15 +127,17 @@ class RobotPose(NamedTuple):
     joints: Floats
     """(N,) radians or metres, in the order of `Robot.joints`"""
     stands: tuple[bool, bool]
-    """whether the left and the right foot are held in place"""
+    """whether the left and the right foot have landed and are held in place"""
 
 
 @dataclass
 class _Foot:
-    """The state of one foot: where it stands, or its progress of being released (``free``, 0 to 1)."""
+    """The state of one foot: where it is held, whether it has landed there, or its progress of being released
+    (``free``, 0 to 1)."""
 
     stood: tuple[Floats, Floats] | None = None
     stands: bool = False
+    landed: bool = False
     free: float = 1.0
 
 
@@ -274,7 +279,7 @@ class Retargeter:
             forward = (now @ self._rest[f"{SIDES[k]}_foot"][0].T)[:, 0]
             flat = yaw_matrix(np.arctan2(forward[1], forward[0])) @ self._rest[f"{SIDES[k]}_foot"][0]
             foot.stood, foot.free = (flat, np.array([at[0], at[1], self._sole])), 0.0
-        foot.stands = stands
+        foot.stands, foot.landed = stands, stands and foot.landed
         if stands and foot.stood:
             return foot.stood
         foot.free = min(1.0, foot.free + dt / RELEASE_S)
@@ -308,7 +313,10 @@ class Retargeter:
     def _pose(self, stamp_ns: int) -> RobotPose:
         q = self._configuration.q
         root = q[[0, 1, 2, 4, 5, 6, 3]].copy()
-        return RobotPose(stamp_ns, root, q[self._q_indices].copy(), (self._feet[0].stands, self._feet[1].stands))
+        for side, foot in zip(SIDES, self._feet, strict=True):
+            if foot.stands and foot.stood:
+                foot.landed |= bool(np.linalg.norm(self._frame(f"{side}_foot")[1] - foot.stood[1]) < LANDED)
+        return RobotPose(stamp_ns, root, q[self._q_indices].copy(), (self._feet[0].landed, self._feet[1].landed))
 
 
 def _touching(body: WorldBody, side: str) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import CONTACTS, JointState, WorldBody
-from steadypose.prior.body.skeleton import REST_POSITIONS, J
+from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
 
 Point = list[float]
 HAND = 0.18
@@ -37,6 +37,11 @@ unobserved hips' height under the neck, metres."""
 ANKLES = [J["left_ankle"], J["right_ankle"]]
 ANKLE_CONTACTS = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
 """Ankles among joints and among `CONTACTS`; those of legs that are only guesses have no contacts."""
+
+_ABOVE = [[J["left_hip"], J["right_hip"]], [J["left_knee"], J["right_knee"]]]
+_BELOW = [[J["left_knee"], J["right_knee"]], ANKLES]
+_LEG = np.linalg.norm(REST_OFFSETS[[[J["left_knee"]], [J["left_ankle"]]]], axis=-1)
+"""Ends of thighs and shanks, and their lengths in an adult, metres."""
 
 EXTENT = [J[name] for name in ("head", "neck", "pelvis", "left_knee", "right_knee", "left_ankle", "right_ankle")]
 
@@ -118,7 +123,7 @@ def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.n
         neck, pelvis = J["neck"], J["pelvis"]
         # a guess's deviation is mostly horizontal: that of hips under an observed neck is the trunk's lean and length
         below = math.hypot(s[neck], TRUNK_SIGMA) if observed[neck] and not observed[pelvis] else math.inf
-        extension, thigh = _from_height(p, hips[2] - floor - ANKLE, leg, min(s[pelvis], below))
+        extension, thigh = _from_height(body.positions, hips[2] - floor - ANKLE, min(s[pelvis], below))
     heights = sorted((p[joint][2], joint) for joint in EXTENT if not math.isnan(p[joint][2]))
     if len(heights) > len(EXTENT) // 2:
         (low, lowest), (high, highest) = heights[0], heights[-1]
@@ -166,10 +171,14 @@ def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
     return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
 
 
-def _from_height(p: list[Point], height: float, leg: float, sigma: float) -> tuple[Quantity, Quantity]:
+def _from_height(p: NDArray[np.float32], height: float, sigma: float) -> tuple[Quantity, Quantity]:
     """Extension of unobserved legs, and angle of their thighs if the shanks are upright, from the height of the hips
-    above a standing ankle and its standard deviation, metres."""
-    thigh = 0.5 * sum(_distance(p[J[f"{side}_hip"]], p[J[f"{side}_knee"]]) for side in ("left", "right"))
+    above a standing ankle and its standard deviation, metres. A bone without an estimate is as long as the other
+    side's, or an adult's."""
+    lengths = np.linalg.norm(p[_BELOW] - p[_ABOVE], axis=-1)
+    lengths = np.where(np.isfinite(lengths), lengths, lengths[:, ::-1])
+    thigh, shank = np.where(np.isfinite(lengths), lengths, _LEG).mean(axis=1).tolist()
+    leg = thigh + shank
     upright = max(-1.0, min(1.0, (height - leg + thigh) / max(thigh, 0.1)))
     spread = math.hypot(sigma, LEG_SIGMA)
     angle = math.nan if math.isnan(height) else math.acos(upright)

@@ -133,8 +133,9 @@ def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits
     calibrated: bool, height: float, hips: bool
 ) -> None:
     """Legs are guessed to stand, always; a floor that is lower or unknown changes what is known of them. Hips that are
-    hidden too are known by the neck, although their place is 20 cm uncertain."""
+    hidden too are known by the neck, although their place is 20 cm uncertain and there is no estimate of the ankles."""
     legs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    ankles = [J["left_ankle"], J["right_ankle"]]
     guessed = legs if hips else [*legs, J["pelvis"], J["left_hip"], J["right_hip"]]
     detector, found = EventDetector(), []
     for index, pose in enumerate([*STILL, *[sitting()] * 20, *STILL]):
@@ -143,6 +144,8 @@ def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits
         world = message(index, seen + [0.0, 0.0, height])
         body = world.bodies[0]
         body.state[guessed], body.sigma[guessed], body.contacts[:6] = JointState.IMPUTED, 0.2, np.nan
+        if not hips:
+            body.state[ankles], body.positions[ankles] = JointState.UNKNOWN, np.nan
         world.ground_plane[3] = -height
         found += [(index, event.kind, event.hand, event.phase) for event in
                   detector.update(world, calibrated=calibrated) if event.phase != Phase.HOLDS]  # fmt: skip
