@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.progress import Progress
@@ -73,10 +73,6 @@ def search(
 def _points(low: np.ndarray, high: np.ndarray, count: int) -> Iterator[np.ndarray]:
     sampler = qmc.Sobol(len(low), scramble=True, rng=0)
     yield from low + sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count] * (high - low)
-
-
-if TYPE_CHECKING:
-    pass
 
 
 DELAYS = (0, 2, 4, 8)

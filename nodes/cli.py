@@ -19,7 +19,7 @@ from importlib.metadata import version
 from io import StringIO
 from typing import Annotated, Any, get_type_hints
 
-from steadypose.nodes.extras import extra_of, how_to_install, upgrade_and_uninstall
+from steadypose.nodes.extras import extra_of, how_to_install, install_command, upgrade_and_uninstall
 from steadypose.prior.settings import nearest
 
 EVALUATE = "steadypose.benchmarks.evaluate"
@@ -81,6 +81,9 @@ def _main(arguments: list[str]) -> int:
         print(version("steadypose"))
         return 0
     name = arguments[0]
+    if name == "add":  # of the checkout's ./steadypose; somebody who installed by pip tries it here
+        print(f"steadypose: to add an extra: {install_command((arguments[1:] or ['EXTRA'])[0])}", file=sys.stderr)
+        return USAGE_ERROR
     if name not in COMMANDS:
         return _unknown(f"no command {name!r}", name, COMMANDS)
     if name == "node":  # OpenBLAS creates its threads (9 MB) when it is loaded, before `one_thread` could prevent it

@@ -67,6 +67,7 @@ def complete_source(
     uncertainty: Uncertainty,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
+    seed: int | None = None,
 ) -> CompletedSource:
     """Complete a source. ``name`` is its name in errors; the other arguments are those of `complete_raws`.
 
@@ -77,7 +78,7 @@ def complete_source(
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
         raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
-    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced)
+    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced, seed)
     settings = TrajectorySettings()
     world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
     answers: list[tuple[str, Message]] = []

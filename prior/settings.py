@@ -117,7 +117,7 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return the end of an error message, which suggests the most similar known name, if there is one."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.5)
+    close = difflib.get_close_matches(str(name), list(known), n=1)
     return f", did you mean {close[0]!r}?" if close else ""
 
 

@@ -31,7 +31,7 @@ from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
-from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS
+from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, FAULTS_IN_DEPTH
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.benchmarks.workload import numpy_ms
 from steadypose.prior.arrays import Floats
@@ -43,6 +43,7 @@ from steadypose.prior.clean.settings import (
     ImputeSettings,
     OrientSettings,
     PersonSettings,
+    PostureSettings,
     PriorSettings,
     RefineSettings,
     ScoreSettings,
@@ -83,6 +84,7 @@ PARTS: Mapping[str, Part] = {
     "without the score": Part(PriorSettings(score=ScoreSettings(enabled=False))),
     "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
     "without fusion": Part(PriorSettings(fuse=FuseSettings(enabled=False))),
+    "without the posture": Part(PriorSettings(posture=PostureSettings(enabled=False))),
     "without orientations by the whole body": Part(PriorSettings(orient=OrientSettings(enabled=False))),
     "with HM-VAE, which is off": Part(PriorSettings(refine=RefineSettings(enabled=True))),
 }
@@ -118,7 +120,14 @@ FLAGGING = (
 SOUND = ("1 cm", "lasting 2 cm")
 """Conditions without a fault."""
 
-FAULTY = ("arms exchanged", "legs exchanged", "left taken for right", "another skeleton", "another person's arm")
+FAULTY = (
+    "arms exchanged",
+    "legs exchanged",
+    "left taken for right",
+    "another skeleton",
+    "another person's arm",
+    *FAULTS_IN_DEPTH,
+)
 """Faults of the tracker, in addition to time-correlated noise of 2 cm."""
 
 
@@ -163,7 +172,7 @@ def _flags(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
         if condition in SOUND:
             seen = noisy_joints.CONDITIONS[condition](clips.positions, rng)
         else:
-            windows, has_fault = FAULTS[condition](noisy.swapaxes(0, 1), rng)
+            windows, has_fault = {**FAULTS, **FAULTS_IN_DEPTH}[condition](noisy.swapaxes(0, 1), rng)
             seen = windows.swapaxes(0, 1)
         for name in bench.progress.track(FLAGGING, description=condition):
             flagged = product.run(PARTS[name].settings, seen, clips.stamps_s, DELAY).flagged[:, has_fault]

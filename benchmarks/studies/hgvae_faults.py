@@ -21,6 +21,7 @@ MIN_MOTION = 0.10
 """Least motion of a frozen joint, metres; with less, it is indistinguishable from a still one."""
 
 _ARM, _LEG, *_ = limbs(("elbow", "wrist"), ("knee", "ankle", "foot"))
+_WHOLE_ARM, _WHOLE_LEG, *_ = limbs(("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "foot"))
 _MOVERS = np.concatenate(limbs(("elbow", "wrist", "knee", "ankle")))
 
 
@@ -89,6 +90,17 @@ def mirrored(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray
     return windows[:, :, MIRROR] * np.array([1.0, -1.0, 1.0]), _all(windows)
 
 
+def in_depth(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Place people 3 m from a camera at the origin, and mirror a limb (its root first) about the image plane from
+    `BEGINS` on; this counts as a fault only where it moves a joint."""
+    del rng
+    placed = windows - windows[:, :1, :1] + np.array([3.0, 0.0, 0.0])
+    out, root = placed.copy(), placed[:, BEGINS:, limb[:1]]
+    ray = root / np.linalg.norm(root, axis=-1, keepdims=True)
+    out[:, BEGINS:, limb] -= 2 * ((placed[:, BEGINS:, limb] - root) * ray).sum(axis=-1, keepdims=True) * ray
+    return out, np.linalg.norm(out - placed, axis=-1).max(axis=(1, 2)) > MIN_MOTION
+
+
 def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """Play backwards: usually no fault."""
     del rng
@@ -107,3 +119,9 @@ FAULTS: Mapping[str, Fault] = {
     "mirrored (no fault)": mirrored,
     "backwards (no fault)": reversed_in_time,
 }
+
+FAULTS_IN_DEPTH: Mapping[str, Fault] = {
+    "arm mirrored in depth": partial(in_depth, limb=_WHOLE_ARM),
+    "leg mirrored in depth": partial(in_depth, limb=_WHOLE_LEG),
+}
+"""Faults that depend on the place of the camera."""

@@ -30,7 +30,7 @@ from steadypose.nodes.sinks.robot import Robot, load_robot
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 
-DEPENDS_ON = (*WORLD, "nodes.sinks.retarget", "nodes.sinks.robot")
+DEPENDS_ON = (*WORLD, "nodes.sinks.retarget", "nodes.sinks.robot", "nodes.sinks.robot_feet", "nodes.sinks.robot_solver")
 
 URDF = ROOT / "launch" / "robots" / "humanoid29.urdf"
 STREAMS = ROOT / "sim_data"
@@ -41,21 +41,23 @@ def faults(robot: Robot, poses: Sequence[RobotPose]) -> dict[str, float]:
     """Measure the published poses of one stream.
 
     Returns:
-        The largest breach of a joint's range, radians; the largest speed of a joint, of its limit; and the largest
-        distance of a standing foot from where it came to stand, mm.
+        The largest breach of a joint's range, radians; the largest speed of a joint, of its limit; the largest distance
+        of a standing foot from where it came to stand, and of any foot below the floor, mm; and the percentage of poses
+        in which at least one foot is published as standing.
     """
     import mujoco
 
     data = mujoco.MjData(robot.model)
     index = [robot.model.joint(name).qposadr[0] for name in robot.joints]
     stood: dict[str, Floats] = {}
-    away = 0.0
+    away = deep = 0.0
     for pose in poses:
         data.qpos[:7] = pose.root[[0, 1, 2, 6, 3, 4, 5]]
         data.qpos[index] = pose.joints
         mujoco.mj_kinematics(robot.model, data)
         for side, stands in zip(SIDES, pose.stands, strict=True):
             at = data.body(robot.links[f"{side}_foot"]).xpos.copy()
+            deep = max(deep, -float(at[2]))
             if stands:
                 away = max(away, float(np.linalg.norm(at - stood.setdefault(side, at))))
             else:
@@ -66,6 +68,8 @@ def faults(robot: Robot, poses: Sequence[RobotPose]) -> dict[str, float]:
         "breach_rad": max(0.0, float((joints - robot.upper).max()), float((robot.lower - joints).max())),
         "speed": float((speeds / robot.speed).max()),
         "foot_mm": 1e3 * away,
+        "deep_mm": 1e3 * deep,
+        "standing": 100.0 * float(np.mean([any(pose.stands) for pose in poses])),
     }
 
 
@@ -94,14 +98,16 @@ def run(bench: Bench) -> Result:
 
 
 def _table(found: dict[str, dict[str, Any]], numpy: float) -> Table:
-    worst = {name: max(one[name] for one in found.values()) for name in ("breach_rad", "speed", "foot_mm")}
-    total = {"frames": sum(one["frames"] for one in found.values())}
+    worst = {name: max(one[name] for one in found.values()) for name in ("breach_rad", "speed", "foot_mm", "deep_mm")}
+    frames = [one["frames"] for one in found.values()]
+    total = {"frames": sum(frames), "standing": np.average([one["standing"] for one in found.values()], weights=frames)}
     every = {"cpu_ms": [ms for one in found.values() for ms in one["cpu_ms"]]}
     rows = []
     for name, one in [*found.items(), (ALL, total | every | worst)]:
         p50, p99 = np.percentile(one["cpu_ms"], (50, 99))
         measures = f"{p50:.2f}", f"{p99:.2f}", f"{p50 / numpy:.2f}", f"{one['breach_rad']:.4f}", f"{one['speed']:.2f}"
-        rows.append([name, str(one["frames"]), *measures, f"{one['foot_mm']:.1f}"])
+        feet = f"{one['foot_mm']:.1f}", f"{one['deep_mm']:.1f}", f"{one['standing']:.0f}"
+        rows.append([name, str(one["frames"]), *measures, *feet])
     return Table(
         name="retarget",
         title="One person to a robot of 29 joints: a frame's processor time, limits, standing feet",
@@ -114,6 +120,8 @@ def _table(found: dict[str, dict[str, Any]], numpy: float) -> Table:
             "worst breach of a range, rad",
             "fastest joint, of its limit",
             "standing foot, at most, mm",
+            "foot below the floor, at most, mm",
+            "some foot stands, % of frames",
         ],
         rows=rows,
         note="`launch/robots/humanoid29.urdf`. cpu: the thread's processor time, which other processes do not "

@@ -52,7 +52,8 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if not np.isfinite(joints).any():
         yield error(
             "all_missing",
-            f"all joints of the last {len(joints)} bodies are NaN: expected metres; where nobody is, send no body",
+            f"all joints of the last {len(joints)} bodies are NaN: expected metres. Where nobody is, send no body; in "
+            "an array, NaN says the same, and this can be ignored",
         )
         return
     if (problem := _degenerate(messages, joints)) is not None:
@@ -186,7 +187,7 @@ def _unit(like: Likeness) -> Problem:
         if SIZES[0] < like.scale / factor < SIZES[1]:
             return error(
                 "unit",
-                f"the body is {height:.3g} m tall: these seem to be {unit}, expected metres; "
+                f"the body is {float(f'{height:.3g}'):g} m tall: these seem to be {unit}, expected metres; "
                 + (f"divide by {factor:g}" if factor > 1 else f"multiply by {1 / factor:g}"),
             )
     return error(

@@ -10,7 +10,7 @@ from rich.progress import Progress
 from steadypose.nodes.commands.output import File, In, Out, check_poses_file, console, plural, write_output
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.offline import complete_source, load_completer
+from steadypose.nodes.offline import CompletedSource, complete_source, load_completer
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import PICTURES, draw_completion, save
 from steadypose.nodes.sources.recording import NO_RIG, open_recording
@@ -26,6 +26,7 @@ def complete(
     skeletons: File = None,
     rig: File = None,
     picture: File = None,
+    samples: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     force: bool = False,
 ) -> int:
     """Fill in gaps between key frames, and unobserved parts of a body, offline.
@@ -59,11 +60,18 @@ def complete(
         skeletons: TOML file, or launch file, with joint layouts of your own as [skeletons.NAME].
         rig: TOML file that describes motion capture which is not recognised: see 'clean'.
         picture: plot to write: .png, .svg or .pdf.
+        samples: also write N alternatives, OUT.1 to OUT.N (for an .npz OUT.1.npz and so on), because what is missing
+            could be otherwise: their completed joints differ from OUT's by about the standard deviation.
         force: replace OUT if it is a recording, an .npz or a .csv.
     """
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
+    alternatives = {seed: out.with_name(f"{out.stem}.{seed}{out.suffix}") for seed in range(1, samples + 1)}
     check_poses_file(source, out, *([picture] if picture else []), replace=force)
+    for other in alternatives.values():
+        check_poses_file(source, other, replace=force)
+    if samples < 0:
+        raise LaunchError(f"--samples: expected 0 or more, got {samples}")
     if picture is not None and picture.suffix not in PICTURES:
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()
@@ -75,15 +83,23 @@ def complete(
     terminal = console()
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
-        completed = complete_source(
-            open_recording(source, read_toml(rig) if rig else NO_RIG),
-            str(source),
-            fill,
-            uncertainty,
-            began=lambda frames: progress.update(bar, total=frames),
-            advanced=lambda frame: progress.update(bar, completed=frame),
-        )
-    write_output(out, completed.arrays, completed.messages)
+
+        def completion_of(seed: int | None) -> CompletedSource:
+            return complete_source(
+                open_recording(source, read_toml(rig) if rig else NO_RIG),
+                str(source),
+                fill,
+                uncertainty,
+                began=lambda frames: progress.update(bar, total=frames),
+                advanced=lambda frame: progress.update(bar, completed=frame),
+                seed=seed,
+            )
+
+        completed = completion_of(None)
+        write_output(out, completed.arrays, completed.messages)
+        for seed, other in alternatives.items():
+            drawn = completion_of(seed)
+            write_output(other, drawn.arrays, drawn.messages)
     completion = completed.completion
     people = len({stretch.body for stretch, _ in completion.done})
     longest = max(done.span for _, done in completion.done) / FPS
@@ -95,6 +111,8 @@ def complete(
         terminal.print(f"  left unknown, too far from any observation: {completion.unreached} joints", style="yellow")
     for body in completion.centred:
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
+    for other in alternatives.values():
+        terminal.print(f"  wrote an alternative: {other}")
     for cause, count in completed.refused.items():
         terminal.print(f"  not used as given, {cause}: {count}")
     if picture is not None:

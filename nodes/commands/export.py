@@ -92,7 +92,7 @@ def retarget(
     urdf: File = None,
     links: Annotated[tuple[str, ...], tyro.conf.arg(name="link", metavar="PART=LINK")] = (),
     sole: float = 0.0,
-    body: int | None = None,
+    body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
     force: bool = False,
 ) -> int:
     """Clean a recording, and convert the person's motion to that of a robot.

@@ -18,7 +18,7 @@ from steadypose.nodes.sinks.plot.history import PlotError, history_of_path
 def plot(
     recording: Annotated[Path, tyro.conf.Positional],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
-    body: int | None = None,
+    body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     over: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO")] = None,
 ) -> None:

@@ -45,7 +45,7 @@ STALL_NS = 15_000_000_000
 
 def run(
     launch: Annotated[str, tyro.conf.Positional] = REPLAY,
-    input: Path | None = None,
+    input: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     rate: Annotated[float | None, tyro.conf.arg(metavar="X")] = None,
     loop: bool = False,
     record: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,

@@ -6,9 +6,10 @@ import sys
 import zipfile
 from importlib import import_module
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
+import tyro
 
 from steadypose.nodes.settings import LaunchError
 from steadypose.training.data.datasets import WeightSet
@@ -41,10 +42,13 @@ LEAST_MIN, ENOUGH_MIN = 0.5, 30.0
 def train(
     model: Model,  # pyright: ignore[reportInvalidTypeForm]
     data: Path = Path("data/prepared.npz"),
-    weights: Literal["default", "research", "kinect_v2"] | None = None,
+    weights: Annotated[
+        Literal["default", "research", "kinect_v2"] | None,
+        tyro.conf.arg(metavar="{default,research,kinect_v2}"),
+    ] = None,
     runs: Path = Path("runs"),
-    iterations: int | None = None,
-    start: str | None = None,
+    iterations: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    start: Annotated[str | None, tyro.conf.arg(metavar="WEIGHTS")] = None,
     seed: int = 0,
     threads: int = 2,
     install: bool = False,

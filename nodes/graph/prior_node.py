@@ -19,7 +19,7 @@ from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
 
-GATED = ("joints_refused", "limbs_exchanged", "joints_stuck")
+GATED = ("joints_refused", "limbs_exchanged", "joints_mirrored", "joints_stuck")
 """Counters of the gate's outlier rejection. They are normal operation, not refused messages."""
 
 OWN_SOURCE_NS, FOREIGN_SOURCE_NS = 10_000_000_000, 2_000_000_000

@@ -246,6 +246,7 @@ def complete(
     confidence: ArrayLike | None = None,
     up: str | None = None,
     weights: str = "default",
+    seed: int | None = None,
 ) -> Poses:
     """Complete motion, offline: `steadypose complete` on arrays.
 
@@ -258,6 +259,8 @@ def complete(
         confidence: as in `clean`. Joints with confidence 0 are missing.
         up: as in `clean`.
         weights: weight set of the completer: 'default', or a .safetensors file.
+        seed: draw an alternative instead of the expected motion, another with each seed: what is missing differs from
+            the expected motion by about ``sigma``.
 
     Returns:
         The arrays of `clean`, with a row every 1/30 s from the first stamp to the last.
@@ -268,7 +271,7 @@ def complete(
     from steadypose.nodes.offline import complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    completed = complete_source(source, "positions", *load_completer(weights))
+    completed = complete_source(source, "positions", *load_completer(weights), seed=seed)
     return Poses(completed.arrays(), refused=completed.refused)
 
 

@@ -129,6 +129,8 @@ def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
         there = {id: int(np.isfinite(world[:, k]).all(axis=(1, 2)).sum()) for k, id in enumerate(ids)}
         place = ids.index(_chosen(path, Counter(there), body))
         seen, world, turned = seen[:, place], world[:, place], turned[:, place]
+    else:
+        _chosen(path, Counter({0: 1}), body)  # a file of one body has no ids; `as_input` calls it 0
     stamps = read_stamps(path, arrays, len(seen)) / 1e9
     # the rotations are in the sensor's frame; a single rotation transforms the whole file to the world
     known = np.isfinite(seen).all(axis=(1, 2)) & np.isfinite(world).all(axis=(1, 2))
@@ -143,7 +145,7 @@ def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
 def _chosen(path: Path, bodies: Counter[int], body: int | None) -> int:
     if not bodies or (body is not None and body not in bodies):
         there = ", ".join(str(id) for id in bodies) or "none"
-        raise ExportError(f"{path}: expected body {'' if body is None else body}, there are {there}")
+        raise ExportError(f"{path}: no body{'' if body is None else f' {body}'} to export; bodies in it: {there}")
     return bodies.most_common(1)[0][0] if body is None else body
 
 

@@ -147,6 +147,6 @@ def _links(path: Path, bodies: list[str], base: str, given: Mapping[str, str]) -
         if link not in bodies:
             raise LaunchError(
                 f"{path}: {f'no link {link!r}' if link else 'no link is named'} for {part}: "
-                f'name one with links, such as {{ {part} = "{bodies[-1]}" }}; there are {", ".join(bodies[2:])}'
+                f'with links = {{ {part} = "LINK" }}, name one of {", ".join(bodies[2:])}'
             )
     return found

@@ -9,6 +9,7 @@ For several bodies: ``positions`` (T, B, J, 3), all NaN where a body is absent; 
 
 from __future__ import annotations
 
+import difflib
 import zipfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -108,6 +109,7 @@ STAMPS_END_NS = 2**31 * 10**9
 """Upper bound of stamps, nanoseconds. ROS 2 stores seconds in an int32."""
 
 _ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body_id")
+_OPTIONAL = {"confidence", "up", "body_id"}
 
 
 class NpzError(ValueError):
@@ -193,7 +195,12 @@ class NpzSource(ArraySource):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, as_input(read_arrays(path, (*_ARRAYS, *CLEANED))))
+        arrays = read_arrays(path, known := (*_ARRAYS, *CLEANED))
+        # a misspelt array that may be missing would be ignored without a word
+        for name in {Path(entry).stem for entry in zipfile.ZipFile(path).namelist()} - set(known):
+            if close := difflib.get_close_matches(name, _OPTIONAL - set(arrays), n=1, cutoff=0.75):
+                raise NpzError(f"{path}: expected an array {close[0]!r}, or none of a similar name; it has {name!r}")
+        super().__init__(path, as_input(arrays))
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -215,8 +222,10 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, N
 
 def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
     if name not in arrays:
+        # `arrays` are those that are known: a misspelt one is in the file alone
+        there = [Path(n).stem for n in zipfile.ZipFile(path).namelist()] if zipfile.is_zipfile(path) else list(arrays)
         raise NpzError(
-            f"{path}: expected an array {name!r}; it has {', '.join(arrays) or 'none that are known'}; needed are "
+            f"{path}: expected an array {name!r}; it has {', '.join(there) or 'none'}; needed are "
             "positions (T, J, 3), skeleton, and fps or stamp_ns"
         )
     return arrays[name]

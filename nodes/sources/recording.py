@@ -24,6 +24,7 @@ from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
+from steadypose.prior.settings import nearest
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
@@ -88,6 +89,8 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
     if not path.exists():
         own = PACKAGE / STREAMS / path.name
         hint = f"; the bundled stream is {path.name!r}, without a folder" if own.is_dir() else ""
+        if len(path.parts) == 1 and not path.suffix:
+            hint = hint or nearest(path.name, (p.name for p in (PACKAGE / STREAMS).iterdir() if p.is_dir()))
         raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video{hint}")
     if path.suffix.lower() in VIDEOS:
         return _open_video(path, image_file)

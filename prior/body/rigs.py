@@ -52,6 +52,10 @@ _ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean(
 """(22,) height of each joint above the hips in the rest pose, metres."""
 
 
+BY_RIG = "steadypose clean --rig FILE (docs/sources.md#motion-capture)"
+"""How to describe a file; `info` and `plot`, which refuse it as well, read what `clean` then writes."""
+
+
 class RigError(ValueError):
     """No body is recognised in a skeleton; the message says what was expected."""
 
@@ -248,7 +252,9 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
             table[middle] = dict.fromkeys(ends, 1.0)
     table |= {joint: name for joint, name in sided.items() if joint in JOINTS}
     if missing := [joint for joint in NEEDED if joint not in table]:
-        raise RigError(f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with --rig which")
+        raise RigError(
+            f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with {BY_RIG} which"
+        )
     return Skeleton("points", tuple(dict.fromkeys(names)), {joint: table[joint] for joint in JOINTS if joint in table})
 
 
@@ -267,7 +273,7 @@ def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
     if len(limbs) < 2:
         raise RigError(
             "expected a body: legs and arms of two bones each, in names that differ by left and right alone; "
-            f"got {', '.join(tree.joints[:8])}...; say with --rig which joints are which"
+            f"got {', '.join(tree.joints[:8])}...; say with {BY_RIG} which joints are which"
         )
     legs, arms = sorted(limbs, key=lambda limb: len(tree.path(limb.trunk)))
     return legs, arms
@@ -281,7 +287,7 @@ def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _S
         way for way in ways if way[: len(trunk)] == trunk != way and sided.isdisjoint(tree.joints[j] for j in way)
     ]
     if not upwards:
-        raise RigError(f"expected neck and head above '{tree.joints[arms.trunk]}', found neither; say with --rig")
+        raise RigError(f"expected neck and head above '{tree.joints[arms.trunk]}', found neither; say with {BY_RIG}")
     named = [way for way in upwards if "head" in tree.joints[way[-1]].lower()]
     way = min(named, key=len) if named else max(upwards, key=len)
     base = max(k for k, (a, b) in enumerate(zip(way, tree.path(legs.trunk), strict=False)) if a == b)
@@ -317,6 +323,6 @@ def _metres(size: float) -> float:
     if not SHORTEST < times[unit] < TALLEST:
         raise RigError(
             f"expected a body of 0.95 to 2.3 m in {', '.join(UNITS)}; got one whose leg and trunk are {size:.4g} long: "
-            "say with --rig how many metres that is"
+            f"say with {BY_RIG} how many metres that is"
         )
     return unit

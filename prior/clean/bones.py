@@ -8,7 +8,8 @@ variance, halved because a bone has two ends, is the bias's variance. If the mea
 or one segment varies by more than the others, the sensor's definition of a joint differs from the skeleton's. The
 length of that segment is then uncertain. The estimates weigh measured bones against human proportions
 (`prior.body.bone_lengths`) and determine how tightly bones constrain hidden joints. Constraining observed joints to the
-bones as well gained 0.2 % of a Kinect's error and cost 0.6 mm on a noise-free input, so they are left alone.
+bones as well gained 0.2 % of a Kinect's error and cost 0.6 mm on a noise-free input, so they are left alone here; the
+posture stage counts lengths as one observation among many.
 """
 
 from __future__ import annotations
@@ -49,6 +50,10 @@ UNKNOWN_VARIANCE = 1e-4
 
 CORRELATION_FRAMES = 5.0
 """Correlation time of the noise after smoothing, frames."""
+
+OWN_LENGTH, GENERIC_LENGTH = 0.015, 0.025
+"""Standard deviation of a sensor's bone length about the person's, and about a generic adult's until the person has
+been measured, metres. A sensor's joints are not exactly the skeleton's."""
 
 MAX_SIGMA = 0.05
 """Largest standard deviation along an axis of a joint that counts for lengths, metres."""
@@ -143,10 +148,13 @@ class SensorBias(NamedTuple):
     Attributes:
         bias_sigma: (S,) metres along an axis, estimated from each body.
         length_variance: (S, R) m², variance of each `RIGID` segment's observed length about the person's bone.
+        lengths: (S, 22) metres, length of each joint's bone: mean of the lately observed one and the person's, weighted
+            by their variances; 0 for the root.
     """
 
     bias_sigma: Floats
     length_variance: Floats
+    lengths: Floats
 
 
 class BiasEstimator:
@@ -170,20 +178,29 @@ class BiasEstimator:
         self._moments[:, slot] = 0.0
         self.bias_sigma = np.where(slot, self._expected, self.bias_sigma)
 
-    def update(self, smoothed: Smoothed | None, offsets: Floats, jitter: Floats) -> SensorBias:
+    def update(self, smoothed: Smoothed | None, person: Person, jitter: Floats) -> SensorBias:
         """Update the estimate with a smoothed frame, if there is one.
 
         Args:
             smoothed: (S, 22) joints and their standard deviations.
-            offsets: (S, 22, 3) metres, the bones in use.
+            person: the bones in use.
             jitter: (S,) metres along an axis, the sensor's jitter.
         """
         expected = np.minimum(self._expected, JITTER_RATIO * jitter)
-        bias, length = expected.copy(), np.full((len(offsets), len(RIGID)), UNKNOWN_VARIANCE)
+        bias, variance = expected.copy(), np.full((len(expected), len(RIGID)), UNKNOWN_VARIANCE)
         if smoothed is not None:
-            _estimate(smoothed.positions, smoothed.sigma, offsets, expected, self._moments, bias, length)
+            _estimate(smoothed.positions, smoothed.sigma, person.offsets, expected, self._moments, bias, variance)
         self.bias_sigma = bias
-        return SensorBias(bias, length)
+        return SensorBias(bias, variance, self._lengths(person))
+
+    def _lengths(self, person: Person) -> Floats:
+        lengths, ends = np.linalg.norm(person.offsets, axis=-1), RIGID[_BONE, 0]
+        frames, mean, _, noise = self._moments[:, :, _BONE]
+        own = person.length_variance[:, ends] + np.where(person.measured, OWN_LENGTH, GENERIC_LENGTH)[:, None] ** 2
+        rough = noise / np.maximum(frames / CORRELATION_FRAMES, 1.0)
+        share = np.where(frames > 0, own / (own + rough), 0.0)
+        lengths[:, ends] += share * (mean - lengths[:, ends])
+        return lengths
 
 
 @njit(cache=True)

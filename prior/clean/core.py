@@ -17,6 +17,7 @@ from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import impute
 from steadypose.prior.clean.occluded import Track
+from steadypose.prior.clean.posture import Posture
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
 from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer
@@ -42,6 +43,7 @@ class _Newest(NamedTuple):
     present: Bools  # (S,) which slots hold a body
     person: Person
     bias: SensorBias  # estimated up to this frame
+    lasting: Floats  # (S,) certainty that the sensor's noise lasts
     left_out: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
     rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
@@ -58,7 +60,7 @@ class CleanCore:
         counters: counts refused joints and skipped frames, by cause.
 
     Attributes:
-        fuse: the stage before orient; public because training records its candidates.
+        fuse: the stage before posture; public because training records its candidates.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:
@@ -77,6 +79,7 @@ class CleanCore:
         self._score = Scorer(settings.score, settings.reconstruct.weights, slots) if score else None
         self._imputes = impute
         self.fuse = Fuse(settings.fuse, slots)
+        self._posture = Posture(settings.posture) if settings.posture.enabled else None
         self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         stages = (
@@ -117,19 +120,21 @@ class CleanCore:
             windows = self._reconstruct.update(self._history, present, person, bias_sigma)
         if self._denoise:
             smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter)
-        bias = self._bias.update(smoothed, person.offsets, gated.jitter)
+        bias = self._bias.update(smoothed, person, gated.jitter)
         left_out = self._depth_error.update(smoothed, self._smooth.white)
         person = self._person.update(smoothed, bias.bias_sigma, present)
         score = Score.unscored(len(present))
         if self._score:
             # Bones show only part of the bias. Assume at least the expected bias, so that it is not flagged as a fault.
             sigma = np.hypot(gated.jitter, np.maximum(bias.bias_sigma, self._bias_sigma))
-            score = self._score.update(windows, gated.frozen, sigma)
+            score = self._score.update(windows, gated.faulty, sigma)
         imputed = impute(windows, gated.jitter, self._delay + 1) if self._imputes else None
         rotations = self._refine.update(gated, person)
         if present.any():
             self._noise = gated.jitter[present], bias.bias_sigma[present]
-        self._newest = newest = _Newest(gated, present, person, bias, left_out, rotations, score, imputed)
+        self._newest = newest = _Newest(
+            gated, present, person, bias, self._smooth.lasting, left_out, rotations, score, imputed
+        )
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
@@ -180,6 +185,11 @@ class CleanCore:
             newest.present,
             Track(self._history.positions, len(self._history.positions) - 1 - back, newest.gated.jitter),
         )
+        if self._posture:
+            noise = np.hypot(newest.gated.jitter, newest.bias.bias_sigma)
+            estimate = self._posture.update(
+                estimate, newest.bias.lengths, noise, newest.lasting, self._history.seen_since(back)
+            )
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         if self._orient:
             estimate = self._orient.update(estimate)

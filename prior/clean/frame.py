@@ -57,13 +57,13 @@ class Gated:
         observation: the input.
         positions: (S, 22, 3) metres; NaN where unobserved or rejected.
         jitter: (S,) metres along an axis, noise that is independent from frame to frame, estimated for each body.
-        frozen: (S, 22) joints for which the tracker repeats its last output.
+        faulty: (S, 22) joints for which the tracker repeats its last output, or that were mirrored back.
     """
 
     observation: Observation
     positions: Floats
     jitter: Floats
-    frozen: Bools
+    faulty: Bools
 
 
 @dataclass(frozen=True)

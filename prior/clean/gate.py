@@ -1,4 +1,4 @@
-"""The gate stage: rejects jumps, impossible bone lengths and frozen joints, and swaps exchanged limbs back."""
+"""The gate stage: rejects jumps, impossible bone lengths and frozen joints; swaps and mirrors limbs back."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import MIRROR, limbs
 from steadypose.prior.clean.frame import Gated, Observation
 from steadypose.prior.clean.history import Ring
+from steadypose.prior.clean.mirrored import MirroredLimbs
 from steadypose.prior.clean.outliers import RECENT, BoneOutliers, frozen_joints
 from steadypose.prior.clean.settings import GateSettings
 from steadypose.prior.compiled import median, njit
@@ -33,7 +34,8 @@ _BODY_JUMP = 0.5  # share of joints that jump at once above which the whole body
 
 
 class Gate:
-    """Outlier rejection. A rejected joint becomes unobserved; the sides of exchanged limbs are swapped back.
+    """Outlier rejection. A rejected joint becomes unobserved; the sides of exchanged limbs are swapped back, and limbs
+    mirrored about the image plane are mirrored back.
 
     A constant-velocity Kalman filter, updated with the accepted joints, predicts each joint. A joint far from its
     prediction is still accepted if its bones kept their lengths and the sensor's bone lengths are constant enough to
@@ -46,6 +48,7 @@ class Gate:
         self._counters = counters
         self._filter = ConstantVelocityFilter(acceleration_density=8.0, measurement_sigma=0.015)
         self._bones = BoneOutliers(slots)
+        self._mirrored = MirroredLimbs(slots)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
         self._mean_distance = np.zeros((slots, 22))
@@ -60,6 +63,7 @@ class Gate:
             self._filter.reset()  # a new stream: its stamps may be earlier
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
         self._bones.forget(slot)
+        self._mirrored.forget(slot)
         self._observed.clear(slot)
         self._jitter[slot] = 0.0
         self._mean_distance[slot] = 0.0
@@ -75,7 +79,7 @@ class Gate:
         positions = observation.positions.copy()
         positions[observation.confidence < s.min_confidence] = np.nan
         slots = np.flatnonzero(observation.present)
-        frozen = np.zeros(positions.shape[:2], dtype=bool)
+        frozen, mirrored = np.zeros((2, *positions.shape[:2]), dtype=bool)
         frozen[slots] = frozen_joints(self._observed.all[:, slots].swapaxes(0, 1))
         if s.enabled and frozen.any():
             self._counters["joints_stuck"] += int(frozen.sum())
@@ -85,17 +89,23 @@ class Gate:
             distance = _apart(positions, expected.positions)
             self._measure_jitter(distance)
             if s.enabled:
-                self._reject(positions, expected, distance)
+                mirrored = self._reject(positions, expected, distance, observation.sensor_position)
         self._lost = np.where(np.isfinite(observation.positions[..., 0]), 0, self._lost + 1)
         self._filter.update(positions, observation.stamp_s)
-        return Gated(observation, positions, self._jitter.copy(), frozen)
+        return Gated(observation, positions, self._jitter.copy(), frozen | mirrored)
 
-    def _reject(self, positions: Floats, expected: Smoothed, distance: Floats) -> None:
-        """Swap exchanged limbs back and set rejected joints to NaN, in place."""
+    def _reject(self, positions: Floats, expected: Smoothed, distance: Floats, camera: Floats) -> Bools:
+        """Swap and mirror limbs back and set rejected joints to NaN, in place; return the joints that were mirrored."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
         if (distance > _SWAP_APART).any() or self._swapped.any():
             self._exchange(positions, expected.positions, known)
+            distance = _apart(positions, expected.positions)
+        mirrored, given_up = self._mirrored.update(positions, expected.positions, camera)
+        if mirrored.any() or given_up.any():
+            self._counters["joints_mirrored"] += int(mirrored.sum())
+            self._restart(given_up)
+            expected.positions[given_up] = np.nan
             distance = _apart(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
         # a fast limb is far from its prediction in every frame, a joint that jumps only once
@@ -117,6 +127,7 @@ class Gate:
         if refused.any():
             self._counters["joints_refused"] += int(refused.sum())
             positions[refused] = np.nan
+        return mirrored
 
     def _measure_jitter(self, distance: Floats) -> None:
         """Update the jitter from the median of a body's distances (S, 22) between joints and predictions.

@@ -174,7 +174,7 @@ class OccludedJoints:
         if len(rows):
             known = np.where(unseen_s[rows] == 0.0, sigma[rows], np.inf)
             positions = np.where(np.isfinite(held[rows]), held[rows], completed[rows])
-            expected = self._posture(positions, known, offsets[rows]).positions
+            expected = self._posture(positions, known, np.linalg.norm(offsets[rows], axis=-1)).positions
             placed[rows] += np.where(arms[rows], POSTURE_SHARE, 0.0)[..., None] * (expected - placed[rows])
 
     def _weigh(

@@ -94,7 +94,7 @@ class Orient:
         if not len(slots):
             return estimate
         positions, sigma, offsets = estimate.positions[slots], estimate.sigma[slots], estimate.offsets[slots]
-        expected = self._posture(positions, sigma, offsets)
+        expected = self._posture(positions, sigma, np.linalg.norm(offsets, axis=-1))
         root = average_root(expected, positions, sigma, offsets)
         turned = global_rotations(solve_rotations(expected.positions, offsets, estimate.rotations[slots], root))
         twist, turns = self._twist[slots], self._turns[slots]

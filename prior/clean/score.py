@@ -80,15 +80,15 @@ class Scorer:
         self._quiet_s[slot] = np.inf
         self._flag = self._flag & ~slot
 
-    def update(self, windows: BodyWindows | None, frozen: Bools, sensor_sigma: Floats) -> Score:
-        """Score the newest frame, in which the joints ``frozen`` (S, 22) repeat themselves.
+    def update(self, windows: BodyWindows | None, faulty: Bools, sensor_sigma: Floats) -> Score:
+        """Score the newest frame, in which the joints ``faulty`` (S, 22) repeat themselves or were mirrored back.
 
         ``sensor_sigma`` (S,) is the estimated error of each body's observations, metres along an axis.
         """
-        anomaly, joint_anomaly = np.full(len(frozen), np.nan), np.full(frozen.shape, np.nan)
+        anomaly, joint_anomaly = np.full(len(faulty), np.nan), np.full(faulty.shape, np.nan)
         if windows is not None:
             slots = windows.slots
-            oddest, joints = self._score(windows, frozen[slots], sensor_sigma[slots])
+            oddest, joints = self._score(windows, faulty[slots], sensor_sigma[slots])
             scale = self._scale.update(slots, oddest)
             anomaly[slots], joint_anomaly[slots] = oddest / scale, joints / scale[:, None]
         with np.errstate(invalid="ignore"):

@@ -178,6 +178,19 @@ class FuseSettings:
 
 
 @dataclass(frozen=True)
+class PostureSettings:
+    """Settings of the posture stage.
+
+    Attributes:
+        enabled: whether joints inform each other; if off, they stay as fused.
+        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
+    """
+
+    enabled: bool = True
+    weights: str = weights_setting("posture")
+
+
+@dataclass(frozen=True)
 class OrientSettings:
     """Settings of the orient stage.
 
@@ -203,8 +216,8 @@ class PriorSettings:
         bias_sigma: metres along an axis, expected standard deviation of the sensor's bias. It is the prior of the bias
             that is estimated from the stream, and a fault must exceed it. Depth cameras have 2 cm or more.
         identify: settings of the identify stage, which assigns body ids instead of the source (off by default).
-        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, orient: settings of the
-            stages.
+        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, posture, orient: settings of
+            the stages.
     """
 
     delay: int = 4
@@ -222,6 +235,7 @@ class PriorSettings:
     impute: ImputeSettings = field(default_factory=ImputeSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
+    posture: PostureSettings = field(default_factory=PostureSettings)
     orient: OrientSettings = field(default_factory=OrientSettings)
 
     def __post_init__(self) -> None:

@@ -28,6 +28,8 @@ from steadypose.prior.body.kinematics import (
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
 from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
+from steadypose.prior.complete.samples import draw
+from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import PERIOD_NS
@@ -105,6 +107,7 @@ def complete_raws(
     uncertainty: Uncertainty,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
+    seed: int | None = None,
 ) -> Completion:
     """Complete the bodies of a recording.
 
@@ -115,6 +118,7 @@ def complete_raws(
         uncertainty: standard deviations of its output.
         began: called with the number of frames of all bodies together.
         advanced: called with the number of finished frames.
+        seed: if given, an alternative is drawn with it (`samples.draw`).
 
     Raises:
         CompletionError: the recording has an unknown skeleton, no body, or no body in metres.
@@ -124,8 +128,12 @@ def complete_raws(
     began(sum(len(stretch.given) for stretch in stretches))
     done: list[tuple[Stretch, Completed]] = []
     before = 0
+    random = np.random.default_rng(seed)
+    covariance = None if seed is None else LivePosture.load("default").covariance
     for stretch in stretches:
         completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
+        if covariance is not None:
+            completed = draw(completed, uncertainty.of(stretch.given), stretch.offsets, covariance, random)
         done.append((stretch, completed))
         before += len(stretch.given)
         advanced(before)
@@ -158,7 +166,10 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
         for stretch in _on_grid(body, np.array(stamps[body]), np.stack(positions[body]), anchor_ns)
     ]
     if not found:
-        raise CompletionError(f"{source}: expected a body with joints in some frame, got none; see what it holds: info")
+        raise CompletionError(
+            f"{source}: expected a body with joints in some frame, got none; see what it holds: "
+            f"steadypose info {source}"
+        )
     return found
 
 

@@ -34,6 +34,10 @@ ANKLE, LEG_SIGMA, TRUNK_SIGMA = 0.07, 0.05, 0.05
 """Height of a standing adult's ankle over the floor, and standard deviations of an unobserved leg's length and of
 unobserved hips' height under the neck, metres."""
 
+SEATED, UPRIGHT = 0.5, 0.85
+"""Heights of the hips above a standing ankle that count as level thighs and as straight legs if both are unobserved, in
+their guessed lengths. A short person's are guessed too long, by up to a fifth."""
+
 ANKLES = [J["left_ankle"], J["right_ankle"]]
 ANKLE_CONTACTS = [CONTACTS.index("left_ankle"), CONTACTS.index("right_ankle")]
 """Ankles among joints and among `CONTACTS`; those of legs that are only guesses have no contacts."""
@@ -172,17 +176,16 @@ def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
 
 
 def _from_height(p: NDArray[np.float32], height: float, sigma: float) -> tuple[Quantity, Quantity]:
-    """Extension of unobserved legs, and angle of their thighs if the shanks are upright, from the height of the hips
-    above a standing ankle and its standard deviation, metres. A bone without an estimate is as long as the other
-    side's, or an adult's."""
+    """Extension of unobserved legs and angle of their thighs, from the height of the hips above a standing ankle and
+    its standard deviation, metres. Between `SEATED` and `UPRIGHT`, they are interpolated. A bone without an estimate is
+    as long as the other side's, or an adult's."""
     lengths = np.linalg.norm(p[_BELOW] - p[_ABOVE], axis=-1)
     lengths = np.where(np.isfinite(lengths), lengths, lengths[:, ::-1])
-    thigh, shank = np.where(np.isfinite(lengths), lengths, _LEG).mean(axis=1).tolist()
-    leg = thigh + shank
-    upright = max(-1.0, min(1.0, (height - leg + thigh) / max(thigh, 0.1)))
-    spread = math.hypot(sigma, LEG_SIGMA)
-    angle = math.nan if math.isnan(height) else math.acos(upright)
-    return Quantity(height / leg, spread / leg), Quantity(angle, spread / max(thigh, 0.1))
+    leg = float(np.where(np.isfinite(lengths), lengths, _LEG).mean(axis=1).sum())
+    upright = (height / leg - SEATED) / (UPRIGHT - SEATED)
+    spread = math.hypot(sigma, LEG_SIGMA) / leg / (UPRIGHT - SEATED)
+    angle = math.nan if math.isnan(height) else math.acos(max(-1.0, min(1.0, upright)))
+    return Quantity(0.5 + 0.5 * upright, 0.5 * spread), Quantity(angle, spread)
 
 
 def _left(body: WorldBody) -> tuple[float, float]:

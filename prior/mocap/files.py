@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.rigs import Rig, RigError, Tree, recognise, recognise_points, up_axis
+from steadypose.prior.body.rigs import BY_RIG, Rig, RigError, Tree, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forward
@@ -175,8 +175,8 @@ def _array(content: bytes, description: Description) -> _Read:
     shape = (len(skeleton.joints), 3)
     if positions.ndim != 3 or positions.shape[1:] != shape or not description.fps:
         raise MotionError(
-            f"expected an array (T, {shape[0]}, 3) of {skeleton.name} and --rig with fps (and skeleton, if it is of "
-            f"another); got {positions.shape} and {description.fps or 'no'} fps"
+            f"expected an array (T, {shape[0]}, 3) of {skeleton.name}, and fps (and skeleton, if it is of another) by "
+            f"{BY_RIG}; got {positions.shape} and {description.fps or 'no'} fps"
         )
     return description.fps, skeleton, positions.astype(np.float64) * (description.metres or 1.0), ""
 

@@ -64,50 +64,62 @@ class Expected(NamedTuple):
 
     Attributes:
         positions: (B, 22, 3) metres.
+        sigma: (B, 22) metres, their standard deviations along an axis.
         root: (B, 3, 3) orientations of the pelvis.
         root_covariance: (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise.
     """
 
     positions: Floats
+    sigma: Floats
     root: Floats
     root_covariance: Floats
 
 
 class LivePosture:
-    """The Gaussian of `steadypose train posture`."""
+    """The Gaussian of `steadypose train posture`.
 
-    def __init__(self, weights: Arrays) -> None:
+    Args:
+        weights: its mean and the factor of its covariance.
+        spread: factor on that covariance: how much more people may differ from the mean than training people do.
+
+    Attributes:
+        covariance: (66, 66) of the joints of an adult in the trunk's frame, m².
+    """
+
+    def __init__(self, weights: Arrays, spread: float = 1.0) -> None:
         factor = weights["factor"].astype(np.float64)
-        whole, mean = factor @ factor.T, weights["mean"].astype(np.float64)
+        whole, mean = spread * factor @ factor.T, weights["mean"].astype(np.float64)
         self._mean, self._turn = mean[:DIMENSIONS], mean[DIMENSIONS:]
-        self._covariance = whole[:DIMENSIONS, :DIMENSIONS] + UNLIKE**2 * np.eye(DIMENSIONS)
-        self._turned_by = np.linalg.solve(self._covariance, whole[:DIMENSIONS, DIMENSIONS:]).T
+        self.covariance = whole[:DIMENSIONS, :DIMENSIONS] + UNLIKE**2 * np.eye(DIMENSIONS)
+        self._turned_by = np.linalg.solve(self.covariance, whole[:DIMENSIONS, DIMENSIONS:]).T
 
     @classmethod
-    def load(cls, weights: str) -> LivePosture:
+    def load(cls, weights: str, spread: float = 1.0) -> LivePosture:
         """Load the weights of this name; raises like `load_weights`."""
-        return cls(load_weights(weights, "posture")[0])
+        return cls(load_weights(weights, "posture")[0], spread)
 
-    def __call__(self, positions: Floats, sigma: Floats, offsets: Floats) -> Expected:
+    def __call__(self, positions: Floats, sigma: Floats, lengths: Floats) -> Expected:
         """Estimate joints from noisy ones.
 
         Args:
             positions: (B, 22, 3) metres, observed joints.
             sigma: (B, 22) metres, their standard deviations along an axis.
-            offsets: (B, 22, 3) metres, the people's bones.
+            lengths: (B, 22) metres, length of each joint's bone, 0 for the root.
         """
-        frame, middle, size = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1), body_size(offsets)
+        frame, middle = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1)
+        size = lengths.sum(axis=-1) / _REST_SIZE
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
         noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
         off, left = local.reshape(len(local), -1) - self._mean, np.empty((len(local), DIMENSIONS, DIMENSIONS))
-        _condition(self._covariance, noise, off, left)
+        _condition(self.covariance, noise, off, left)
         local = (self._mean + off).reshape(local.shape)
-        expected, left = on_bones(local * scale, left * scale**2, np.linalg.norm(offsets[:, 1:], axis=-1))
+        expected, left = on_bones(local * scale, left * scale**2, np.ascontiguousarray(lengths[:, 1:]))
         off = (expected / scale).reshape(len(local), -1) - self._mean
         root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
-        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], root, turned)
+        variance = np.diagonal(left, axis1=1, axis2=2).reshape(-1, 22, 3).mean(axis=-1)
+        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], np.sqrt(variance), root, turned)
 
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
@@ -145,7 +157,7 @@ class RootCovariance:
         """
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0
-        known = self._posture(positions, sigma, bones).root_covariance + np.diag(WITHIN**2)
+        known = self._posture(positions, sigma, np.linalg.norm(bones, axis=-1)).root_covariance + np.diag(WITHIN**2)
         rigid = rigid_covariance(sigma, bones @ root)
         covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
         return root @ covariance @ root.swapaxes(-1, -2)

@@ -4,7 +4,7 @@ import torch
 from tests.helpers.bodies import waving
 
 from steadypose.benchmarks.studies import hgvae_imputation as imputation
-from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, MIN_MOTION
+from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, FAULTS_IN_DEPTH, MIN_MOTION
 from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from steadypose.prior.models.hgvae.config import JOINT_NODES, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks
@@ -47,6 +47,20 @@ def test_left_for_right_is_the_other_sides_joint() -> None:
     clean = waving(50)[None]
     corrupted, _ = FAULTS["left taken for right"](clean, np.random.default_rng(0))
     np.testing.assert_array_equal(corrupted[0, :, J["left_wrist"]], clean[0, :, MIRROR[J["left_wrist"]]])
+
+
+def test_a_limb_mirrored_in_depth_keeps_its_bones_and_its_direction_from_the_camera_before_it() -> None:
+    clean = np.stack([waving(50), waving(50, speed=2.0)]) + [7.0, 8.0, 0.0]
+    corrupted, holds = FAULTS_IN_DEPTH["leg mirrored in depth"](clean, np.random.default_rng(0))
+    placed, _ = FAULTS_IN_DEPTH["leg mirrored in depth"](clean[:, :BEGINS], np.random.default_rng(0))
+    np.testing.assert_array_equal(corrupted[:, :BEGINS], placed)
+    np.testing.assert_allclose(corrupted[:, 0, 0], [[3.0, 0.0, 0.0]] * 2, atol=1e-12)
+    hip, knee = (corrupted[:, BEGINS:, J[f"left_{joint}"]] for joint in ("hip", "knee"))
+    bone, moved = knee - hip, (clean[:, BEGINS:, J["left_knee"]] - clean[:, BEGINS:, J["left_hip"]])
+    np.testing.assert_allclose(np.linalg.norm(bone, axis=-1), np.linalg.norm(moved, axis=-1))
+    np.testing.assert_allclose((bone * hip).sum(axis=-1), -(moved * hip).sum(axis=-1))
+    np.testing.assert_allclose(np.cross(bone - moved, hip), 0.0, atol=1e-12)
+    assert holds.all()
 
 
 @pytest.fixture

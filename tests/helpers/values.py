@@ -37,5 +37,5 @@ def observation(positions: np.ndarray, stamp_s: float = 0.0, confidence: np.ndar
 
 def gated(positions: np.ndarray, stamp_s: float = 0.0) -> Gated:
     """Bodies (S, 22, 3) that are all there, as they came."""
-    frozen = np.zeros(positions.shape[:2], dtype=bool)
-    return Gated(observation(positions, stamp_s), positions, np.zeros(len(positions)), frozen)
+    faulty = np.zeros(positions.shape[:2], dtype=bool)
+    return Gated(observation(positions, stamp_s), positions, np.zeros(len(positions)), faulty)

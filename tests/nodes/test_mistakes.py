@@ -162,6 +162,23 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
 }
 
+UNKNOWN_BVH = """HIERARCHY
+ROOT a
+{
+OFFSET 0 0 0
+CHANNELS 3 Xrotation Yrotation Zrotation
+End Site
+{
+OFFSET 0 1 0
+}
+}
+MOTION
+Frames: 2
+Frame Time: 0.03
+0 0 0
+0 0 0
+"""
+
 ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
     "no such file": (["clean", "nowhere.npz", "out.npz"], {}, "nowhere.npz does not exist: expected"),
     "no such folder": (["clean", "in.csv", "nowhere/out.npz"], {"in.csv": ""}, "to exist; make it first"),
@@ -209,6 +226,18 @@ ANSWERED: dict[str, tuple[list[str], dict[str, str], str]] = {
         {"in.csv": ""},
         "--events: expected a single recording as IN",
     ),
+    "a sample, misspelt": (["clean", "walk_tern", "out.npz"], {}, "or a video, did you mean 'walk_turn'?"),
+    "motion capture that is not recognised, to a command without --rig": (
+        ["info", "in.bvh"],
+        {"in.bvh": UNKNOWN_BVH},
+        "in.bvh: expected a body: legs and arms",
+    ),
+    "fewer than no alternatives": (
+        ["complete", "in.csv", "out.npz", "--samples", "-1"],
+        {"in.csv": ""},
+        "--samples: expected 0 or more, got -1",
+    ),
+    "an extra to add, where steadypose is installed by pip": (["add", "webcam"], {}, "to add an extra: "),
     "a command that there is not": (["claen"], {}, "did you mean 'clean'?"),
 }
 
@@ -325,3 +354,12 @@ def test_who_lies_for_a_while_is_no_reason_to_distrust_a_recording(joints: np.nd
     assert list(fell.diagnosis.problems) == ["up_axis"]
     assert fell.diagnosis.trusted
     assert not run(lying, lying, lying, joints).diagnosis.trusted
+
+
+def test_a_misspelt_array_is_named(tmp_path: Path, joints: np.ndarray, capsys: pytest.CaptureFixture[str]) -> None:
+    np.savez(tmp_path / "in.npz", joints=joints, fps=30)
+    assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 2
+    assert "it has joints, fps; needed are positions" in capsys.readouterr().err
+    np.savez(tmp_path / "up.npz", positions=joints, skeleton="smpl22", fps=30, upp="-y", scores=np.zeros(5))
+    assert main(["clean", str(tmp_path / "up.npz"), str(tmp_path / "out.npz")]) == 2
+    assert "expected an array 'up', or none of a similar name; it has 'upp'" in capsys.readouterr().err

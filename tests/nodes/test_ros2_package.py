@@ -99,7 +99,8 @@ def test_a_lifecycle_starts_and_ends_the_program(
         return {name for name, _ in graph.get_topic_names_and_types() if graph.count_publishers(name)}
 
     assert state(graph) == "unconfigured"
-    assert ("steadypose", "/fleet/robot") in graph.get_node_names_and_namespaces()
+    # names may be heard of later than services
+    until(lambda: ("steadypose", "/fleet/robot") in graph.get_node_names_and_namespaces(), timeout_s=30)
     assert change(graph, "configure")
     assert change(graph, "activate")
     until(lambda: {"/fleet/robot/steadypose/pose_raw", "/diagnostics"} <= topics(), timeout_s=60)

@@ -48,6 +48,7 @@ class MixtureSmoother:
     Attributes:
         delay: look-ahead, frames.
         white: (S,) share of each body's noise that is white, estimated up to the newest frame.
+        lasting: (S,) certainty that it lasts instead.
     """
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
@@ -59,7 +60,8 @@ class MixtureSmoother:
         shapes = (joints, joints, body, body, (slots, 22, OUTPUTS))
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
-        self._whiteness, self.white = Whiteness(slots, delay), np.zeros(slots)
+        self._whiteness = Whiteness(slots, delay)
+        self.white, self.lasting = np.zeros(slots), self._whiteness.lasting
         self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
@@ -80,7 +82,7 @@ class MixtureSmoother:
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)
-        self.white = self._whiteness.share(positions)
+        self.white, self.lasting = self._whiteness.share(positions), self._whiteness.lasting
         advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
         return self._answer(self.delay) if self._count > self.delay else None
 

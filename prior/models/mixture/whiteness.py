@@ -33,6 +33,9 @@ OWN = 3e-3
 """Standard deviation of slow variations of a bone's length that are not attributed to the sensor, metres. Joints
 computed from skin markers are not ends of rigid bones: in UI-PRMD, lengths vary by 2.5 mm (median)."""
 
+CERTAIN = 1.25
+"""Factor on the share of the noise that is not white; with a white share of a fifth or less, all of it lasts."""
+
 LARGE, LARGE_NEWEST = 0.014, 0.01
 """White noise along an axis in which the weight of the multiple-model estimate is at most three quarters, metres; the
 second without delay. The limit is 1 in much smaller noise and 0.5 in much larger noise, where the network helps."""
@@ -54,9 +57,13 @@ class Whiteness:
     Args:
         slots: number of bodies.
         delay: look-ahead of the smoother, frames.
+
+    Attributes:
+        lasting: (S,) certainty that the noise is not white but lasts, from 0 at the start to 1.
     """
 
     def __init__(self, slots: int, delay: int) -> None:
+        self.lasting = np.zeros(slots)
         self._start = START if delay else START_NEWEST
         self._last, self._step = np.full((2, slots, _BONES), np.nan)
         self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, _BONES))
@@ -80,6 +87,8 @@ class Whiteness:
             self._undone, white,
         )  # fmt: skip
         frames = self._frames.max(axis=1)
+        lasting = np.minimum(CERTAIN * (1.0 - np.minimum(SHARE * white**2, 1.0)), 1.0)
+        self.lasting = lasting * frames / (frames + START_NEWEST)
         return white * frames / (frames + self._start)
 
 

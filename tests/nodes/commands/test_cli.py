@@ -159,7 +159,7 @@ for missing, (_, arguments) in {lacking}.items():
 
 
 @pytest.mark.parametrize(
-    "command", [["run"], ["clean"], pytest.param(["train"], marks=pytest.mark.slow), ["calibrate", "floor"]]
+    "command", [["run"], ["clean"], ["plot"], pytest.param(["train"], marks=pytest.mark.slow), ["calibrate", "floor"]]
 )
 def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -168,6 +168,7 @@ def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monke
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80
     words = {word for line in lines for word in line.split()}
+    assert not any("{None" in word for word in words)
     assert "None)" not in words, "no default beside the one that is described"
     assert words >= {"steadypose", "options"}
     assert not any(line.strip() in ("the", "own", "any") for line in lines), "no line of a docstring shows"

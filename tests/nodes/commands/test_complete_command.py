@@ -10,6 +10,7 @@ import pytest
 from conftest import write_npz
 from tests.helpers.bodies import waving
 
+import steadypose
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState, PoseClean
@@ -85,6 +86,27 @@ def test_who_stands_on_the_pelvis_is_given_a_way(tmp_path: Path, capsys) -> None
     out = np.load(tmp_path / "out.npz")
     assert np.ptp(out["positions"][:, 0], axis=0).max() < 1e-6
     assert np.ptp(out["world_positions"][:, 0, :2], axis=0).max() > 1e-3
+
+
+def test_alternatives_differ_where_nothing_was_given(tmp_path: Path, capsys) -> None:
+    positions = waving(60)
+    positions[5:, [J["left_elbow"], J["left_wrist"]]] = np.nan
+    source = write_npz(tmp_path / "in.npz", positions)
+    complete(source, tmp_path / "out.npz", samples=12)
+    both = (np.load(tmp_path / f"out{name}.npz")["rotations"] for name in ("", ".1"))
+    np.testing.assert_array_equal(*(turned[:5] for turned in both))
+    assert f"wrote an alternative: {tmp_path / 'out.12.npz'}" in capsys.readouterr().err
+    expected = np.load(tmp_path / "out.npz")
+    drawn = [np.load(tmp_path / f"out.{seed}.npz")["positions"] for seed in range(1, 13)]
+    known = np.isfinite(positions)
+    for other in drawn:
+        np.testing.assert_array_equal(other[known], expected["positions"][known])
+        forearm = np.linalg.norm(other[:, J["left_wrist"]] - other[:, J["left_elbow"]], axis=-1)
+        assert np.ptp(forearm) < 0.01
+    off = np.linalg.norm(np.array(drawn) - expected["positions"], axis=-1)[:, 25:, J["left_wrist"]]
+    assert 0.6 < np.sqrt((off**2).mean() / 3) / expected["sigma"][25:, J["left_wrist"]].mean() < 1.2
+    again = steadypose.complete(positions, fps=30.0, seed=3)
+    np.testing.assert_allclose(again.positions, drawn[2], atol=1e-6)
 
 
 def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.sinks.glb import to_glb
-from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, read_motion, to_bvh, to_csv, to_trc
+from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, ExportError, read_motion, to_bvh, to_csv, to_trc
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
@@ -158,6 +158,13 @@ def test_of_a_recording_the_body_that_is_there_longest_or_was_asked_for(tmp_path
     np.testing.assert_allclose(read_motion(path).positions, motion.positions, atol=1e-5)
     np.testing.assert_allclose(read_motion(path, 3).positions[:, 0, 0], motion.root[21:, 0] + 30.0, atol=1e-5)
     assert main(["export", str(path), str(tmp_path / "x.bvh"), "--body", "7"]) != 0
+
+
+def test_of_an_npz_of_one_body_another_id_is_refused(tmp_path: Path, motion: BodyMotion) -> None:
+    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    assert len(read_motion(path, 0).root) == FRAMES, "`info` calls it 0"
+    with pytest.raises(ExportError, match="no body 7 to export; bodies in it: 0"):
+        read_motion(path, 7)
 
 
 def test_a_gap_is_filled_and_the_rate_kept(tmp_path: Path, motion: BodyMotion) -> None:

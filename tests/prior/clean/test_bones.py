@@ -11,7 +11,7 @@ from steadypose.prior.clean.frame import Person
 from steadypose.prior.clean.settings import PersonSettings
 from steadypose.prior.timing.kalman import Smoothed
 
-BONES = np.tile(REST_OFFSETS, (1, 1, 1))
+BONES = Person.generic(1)
 
 
 def found(seen: np.ndarray, sigma: float, jitter: float, bias_sigma: float = 0.02) -> SensorBias:
@@ -68,6 +68,17 @@ def test_a_body_that_leaves_is_forgotten() -> None:
     estimator.forget(np.array([True]))
     nothing = Smoothed(0.0, np.full((1, 22, 3), np.nan), np.full((1, 22), np.inf))
     assert estimator.update(nothing, BONES, np.array([0.02])).bias_sigma[0] == pytest.approx(0.02)
+
+
+def test_lengths_are_those_observed_as_soon_as_they_are_known() -> None:
+    generic = np.linalg.norm(BONES.offsets[0], axis=-1)
+    nothing = found(np.full((1, 22, 3), np.nan), sigma=0.01, jitter=0.0)
+    np.testing.assert_allclose(nothing.lengths[0], generic)
+    seen = found(1.1 * waving(60), sigma=1e-4, jitter=1e-4)
+    np.testing.assert_allclose(seen.lengths[0], 1.1 * generic, rtol=0.01)
+    rough = found(1.1 * waving(6), sigma=0.04, jitter=0.04).lengths[0]
+    assert (rough[1:] > generic[1:]).all()
+    assert (rough[1:] < 1.05 * generic[1:]).all()
 
 
 BIAS = 0.02

@@ -122,7 +122,8 @@ def test_a_perfect_input_stays_what_it_is(delay: int) -> None:
     cleaned, _ = clean(stream(truth), delay=delay)
     apart = np.linalg.norm(positions(cleaned) - truth[: len(cleaned)], axis=-1)
     assert apart.mean() < 0.001
-    assert apart.max() < 0.004
+    assert apart[0].max() < 0.01, "without delay, nothing is known of the noise yet"
+    assert apart[1:].max() < 0.004
 
 
 def test_rotations_and_bones_place_the_joints_where_they_are_said_to_be() -> None:

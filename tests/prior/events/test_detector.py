@@ -127,20 +127,23 @@ def test_a_pose_begins_one_event_within_a_third_of_a_second_and_ends_it(
 
 
 @pytest.mark.parametrize(
-    ("calibrated", "height", "hips"), [(True, 0.0, True), (True, 0.6, True), (False, 0.0, True), (True, 0.0, False)]
-)
+    ("calibrated", "height", "hips", "guess"),
+    [(True, 0.0, True, 1.0), (True, 0.6, True, 1.0), (False, 0.0, True, 1.0), (True, 0.0, False, 1.0),
+     (True, 0.0, True, 1.12), (True, 0.0, True, 0.9)],
+)  # fmt: skip
 def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits(
-    calibrated: bool, height: float, hips: bool
+    calibrated: bool, height: float, hips: bool, guess: float
 ) -> None:
-    """Legs are guessed to stand, always; a floor that is lower or unknown changes what is known of them. Hips that are
-    hidden too are known by the neck, although their place is 20 cm uncertain and there is no estimate of the ankles."""
+    """Legs are guessed to stand, always, and as those of somebody taller or shorter; a floor that
+    is lower or unknown changes what is known of them. Hips that are hidden too are known by the neck, although their
+    place is 20 cm uncertain and there is no estimate of the ankles."""
     legs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
     ankles = [J["left_ankle"], J["right_ankle"]]
     guessed = legs if hips else [*legs, J["pelvis"], J["left_hip"], J["right_hip"]]
     detector, found = EventDetector(), []
     for index, pose in enumerate([*STILL, *[sitting()] * 20, *STILL]):
         seen, middle = pose.copy(), pose[[J["left_hip"], J["right_hip"]]].mean(axis=0)
-        seen[legs] = (standing() - standing()[J["pelvis"]])[legs] + middle
+        seen[legs] = guess * (standing() - standing()[J["pelvis"]])[legs] + middle
         world = message(index, seen + [0.0, 0.0, height])
         body = world.bodies[0]
         body.state[guessed], body.sigma[guessed], body.contacts[:6] = JointState.IMPUTED, 0.2, np.nan

@@ -58,8 +58,9 @@ def test_legs_that_are_hidden_for_a_while_go_on(model: HumorNet, truth: np.ndarr
     seen, start = truth.copy(), truth.copy()
     seen[15:30, leg] = np.nan
     start[15:30, leg] = start[14, leg]  # as a sensor that holds what it lost
-    found = fitted(model, [Start.of_joints(start, ground_known=True)], seen_joints(seen), 3, BRIEF)
-    assert error(found.joints[15:30, leg], truth[15:30, leg]) < 0.7 * error(start[15:30, leg], truth[15:30, leg])
+    # BRIEF ends before the leg has moved far, and how far differs between processors.
+    found = fitted(model, [Start.of_joints(start, ground_known=True)], seen_joints(seen), 3, FitSettings())
+    assert error(found.joints[15:30, leg], truth[15:30, leg]) < 0.5 * error(start[15:30, leg], truth[15:30, leg])
 
 
 def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: MotionClips) -> None:

@@ -146,7 +146,7 @@ def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_g
         assert answer.joints.tolist() == [[0, joint] for joint in limb]
         above = PARENT[limb[0]]
         standing = frame[0, above] + (STANDING[limb] - STANDING[above]) @ yaw_matrix(facing(frame))[0].T
-        expected = posture(frame, sigma, bones(frame)).positions[0, limb]
+        expected = posture(frame, sigma, np.linalg.norm(bones(frame), axis=-1)).positions[0, limb]
         off.append(answer.positions - (1.0 - share) * 0.5 * (frame[0, limb] + standing) - share * expected)
     assert not asked.rows
     np.testing.assert_allclose(off[10:], 0.0, atol=0.05)

@@ -30,10 +30,11 @@ def posture() -> LivePosture:
 
 
 OFFSETS = np.broadcast_to(REST_OFFSETS, (BODIES, 22, 3))
+LENGTHS = np.linalg.norm(OFFSETS, axis=-1)
 
 
 def test_joints_that_are_known_stay(posture: LivePosture, joints: np.ndarray) -> None:
-    expected = posture(joints, np.zeros((BODIES, 22)), OFFSETS)
+    expected = posture(joints, np.zeros((BODIES, 22)), LENGTHS)
     np.testing.assert_allclose(expected.positions, joints, atol=1e-6)
 
 
@@ -41,21 +42,35 @@ def test_a_joint_of_which_nothing_is_said_follows_the_others(posture: LivePostur
     sigma, off = np.full((BODIES, 22), 0.002), joints.copy()
     sigma[:, J["spine3"]] = np.nan
     off[:, J["spine3"]] += 0.3
-    expected = posture(off, sigma, OFFSETS).positions
+    expected = posture(off, sigma, LENGTHS).positions
     assert np.median(np.linalg.norm(expected - joints, axis=-1)[:, J["spine3"]]) < 0.05
 
 
 def test_bones_keep_the_persons_lengths(posture: LivePosture, joints: np.ndarray) -> None:
     noisy = joints + np.random.default_rng(4).normal(0.0, 0.03, joints.shape)
-    expected = posture(noisy, np.full((BODIES, 22), 0.03), OFFSETS).positions
-    off = np.linalg.norm(expected[:, 1:] - expected[:, PARENT[1:]], axis=-1) - np.linalg.norm(OFFSETS[:, 1:], axis=-1)
+    expected = posture(noisy, np.full((BODIES, 22), 0.03), LENGTHS).positions
+    off = np.linalg.norm(expected[:, 1:] - expected[:, PARENT[1:]], axis=-1) - LENGTHS[:, 1:]
     assert np.sqrt(np.square(off).mean()) < 0.5 * LENGTH_SIGMA
+
+
+def test_the_deviation_of_the_answer_is_honest(posture: LivePosture, joints: np.ndarray) -> None:
+    noisy = joints + np.random.default_rng(5).normal(0.0, 0.02, joints.shape)
+    expected = posture(noisy, np.full((BODIES, 22), 0.02), LENGTHS)
+    error = np.square(expected.positions - joints).mean(axis=-1)
+    assert 0.5 < error.mean() / np.square(expected.sigma).mean() < 1.3
+
+
+def test_a_wider_gaussian_moves_joints_less(posture: LivePosture, joints: np.ndarray) -> None:
+    noisy, sigma = joints + np.random.default_rng(6).normal(0.0, 0.02, joints.shape), np.full((BODIES, 22), 0.02)
+    moved = [np.linalg.norm(p(noisy, sigma, LENGTHS).positions - noisy, axis=-1).mean()
+             for p in (posture, LivePosture.load("default", 8.0))]  # fmt: skip
+    assert moved[1] < 0.95 * moved[0]
 
 
 def test_lengths_of_bones_bring_joints_nearer_and_the_covariance_says_by_how_much(joints: np.ndarray) -> None:
     rng, sigma = np.random.default_rng(3), 0.03
     noisy = joints + rng.normal(0.0, sigma, joints.shape)
-    lengths = np.linalg.norm(OFFSETS[:, 1:], axis=-1) + rng.normal(0.0, LENGTH_SIGMA, (BODIES, 21))
+    lengths = LENGTHS[:, 1:] + rng.normal(0.0, LENGTH_SIGMA, (BODIES, 21))
     covariance = np.broadcast_to(sigma**2 * np.eye(66), (BODIES, 66, 66))
     mean, left = on_bones(noisy, covariance, lengths)
     error = np.square(mean - joints).sum()
@@ -67,13 +82,13 @@ def test_lengths_of_bones_bring_joints_nearer_and_the_covariance_says_by_how_muc
 def test_the_answer_turns_with_the_body_however_it_lies(posture: LivePosture, joints: np.ndarray) -> None:
     turn = Rotation.from_rotvec([1.2, -0.7, 2.0]).as_matrix()
     sigma = np.full((BODIES, 22), 0.02)
-    upright, lying = posture(joints, sigma, OFFSETS), posture(joints @ turn.T + 5.0, sigma, OFFSETS)
+    upright, lying = posture(joints, sigma, LENGTHS), posture(joints @ turn.T + 5.0, sigma, LENGTHS)
     np.testing.assert_allclose(lying.positions, upright.positions @ turn.T + 5.0, atol=1e-9)
 
 
 def _root(posture: LivePosture, joints: np.ndarray, sigma: float) -> np.ndarray:
     deviations = np.full((BODIES, 22), sigma)
-    return average_root(posture(joints, deviations, OFFSETS), joints, deviations, OFFSETS)
+    return average_root(posture(joints, deviations, LENGTHS), joints, deviations, OFFSETS)
 
 
 def _angles(turned: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -54,6 +54,17 @@ def test_white_noise_is_known_within_a_third_of_a_second() -> None:
     assert whiteness_of(truth + lasting(truth.shape, 0.5)) < 0.2
 
 
+def test_that_noise_lasts_is_not_certain_at_first() -> None:
+    truth = waving(FRAMES)
+    for seconds, high in ((0.0, 0.1), (0.5, 1.0)):
+        whiteness, certain = Whiteness(1, 4), []
+        for frame in truth + lasting(truth.shape, seconds):
+            whiteness.update(frame[None])
+            certain.append(whiteness.lasting[0])
+        assert certain[0] < 0.1
+        assert high - 0.25 < certain[-1] <= high
+
+
 def test_motion_without_noise_is_not_white() -> None:
     assert whiteness_of(waving(FRAMES)) == 0.0
 

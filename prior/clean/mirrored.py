@@ -1,0 +1,153 @@
+"""Limbs mirrored about the image plane: found at the onset, and mirrored back.
+
+An image hardly shows whether an arm points to the camera or away from it, so estimators of depth mistake the sign of a
+limb's depth relative to its root, for seconds. Most mirrored limbs are possible poses with the right bone lengths. But
+the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back. The end
+is found by the same test. Near the image plane neither is seen, so no limb is mirrored back for long.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.body.skeleton import limbs
+from steadypose.prior.compiled import njit
+
+LEAST, DEVIATIONS = 0.08, 5.0
+"""Least distance of a limb to its prediction, along the ray, for an onset or an end: metres, and multiples of its root
+mean square so far (chosen on validation, benchmarks/NOTEBOOK.md)."""
+
+MOVED = 0.03
+"""Least such distance of two joints at an onset, metres. If a single joint is far, it has jumped."""
+
+BETTER = 0.5
+"""Share to which mirroring must reduce the limb's distance to its prediction."""
+
+MEMORY, FIRST = 20, 10
+"""Length of the running mean square of that distance, and number of frames before a limb is judged."""
+
+LONGEST, REMEMBERED = 30, 300
+"""Longest time for which a limb is mirrored back, and time for which it is remembered that this was given up, frames.
+While it is remembered, the next onset is taken for the end of the fault."""
+
+MIN_RANGE = 0.8
+"""Least distance of a limb's root from the sensor, metres. Nearer joints are relative to the body, not to a camera, and
+no ray is known."""
+
+_PARTS = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "foot")
+_LIMBS = np.array([[*limb, -1][:4] for limb in limbs(*_PARTS)])
+"""(4, 4) root and joints of each limb; -1 where a limb has fewer."""
+
+
+class MirroredLimbs:
+    """Mirrors arms and legs of ``slots`` bodies back, relative to their shoulders and hips."""
+
+    def __init__(self, slots: int) -> None:
+        self._square = np.zeros((slots, len(_LIMBS)))
+        self._frames = np.zeros((slots, len(_LIMBS)), dtype=np.int64)
+        self._since = np.zeros((slots, len(_LIMBS)), dtype=np.int64)
+
+    def forget(self, slot: Bools) -> None:
+        """Forget the bodies in these slots (S,)."""
+        for values in (self._square, self._frames, self._since):
+            values[slot] = 0
+
+    def update(self, positions: Floats, expected: Floats, camera: Floats) -> tuple[Bools, Bools]:
+        """Mirror limbs back, in place.
+
+        Args:
+            positions: (S, 22, 3) metres, NaN where unobserved.
+            expected: (S, 22, 3) metres, the prediction; NaN where unknown.
+            camera: (3,) metres, position of the sensor.
+
+        Returns:
+            (S, 22) joints that were mirrored back, and joints for which this is given up in this frame.
+        """
+        back = np.zeros(positions.shape[:2], dtype=np.bool_)
+        given_up = np.zeros_like(back)
+        _mirror_back(positions, expected, camera, self._square, self._frames, self._since, back, given_up)
+        return back, given_up
+
+
+@njit(cache=True)
+def _mirror_back(positions, expected, camera, square, frames, since, back, given_up):
+    """Compute `MirroredLimbs.update`. ``since`` (S, 4) counts the frames for which a limb has been mirrored back;
+    negative, those for which it will still be remembered that this was given up."""
+    ray = np.empty(3)
+    for row in range(len(positions)):
+        for limb in range(len(_LIMBS)):
+            root, joints, now = _LIMBS[limb, 0], _LIMBS[limb, 1:], since[row, limb]
+            if now != 0:
+                now += 1
+            away = _to_limb(positions[row, root], camera, ray)
+            seen, moved, kept, mirrored, across = _distances(positions[row], expected[row], root, joints, ray, now > 0)
+            if seen > 0 and away > MIN_RANGE:
+                far = frames[row, limb] >= FIRST and kept > max(LEAST**2, DEVIATIONS**2 * square[row, limb])
+                if far and (now > 0 or moved >= 2) and mirrored + across < BETTER**2 * (kept + across):
+                    kept, now = mirrored, 1 if now == 0 else 0
+                frames[row, limb] = min(frames[row, limb] + 1, MEMORY)
+                square[row, limb] += (kept - square[row, limb]) / frames[row, limb]
+            if now > LONGEST:
+                now = -REMEMBERED
+                for joint in joints:
+                    given_up[row, joint] |= joint >= 0
+            since[row, limb] = now
+            if now > 0:
+                _reflect(positions[row], root, joints, ray, back[row])
+
+
+@njit(cache=True)
+def _to_limb(root, camera, ray):
+    """Write the direction from the camera to a limb's root and return the distance, metres."""
+    away = 0.0
+    for axis in range(3):
+        ray[axis] = root[axis] - camera[axis]
+        away += ray[axis] ** 2
+    away = math.sqrt(away)
+    for axis in range(3):
+        ray[axis] /= away
+    return away
+
+
+@njit(cache=True)
+def _distances(positions, expected, root, joints, ray, held):
+    """Return how many joints are known, and their mean square distances to predictions, m²: along the ray as believed,
+    along the ray if mirrored, and across it.
+
+    ``held`` says whether the limb is being mirrored back. What is mirrored is relative to the root, whose noise counts
+    too; what is not is more certain by itself.
+    """
+    count, moved, kept, mirrored, across = 0, 0, 0.0, 0.0, 0.0
+    for joint in joints:
+        depth, ahead, off, square = 0.0, 0.0, 0.0, 0.0
+        for axis in range(3):
+            depth += (positions[joint, axis] - positions[root, axis]) * ray[axis]
+            ahead += (expected[joint, axis] - expected[root, axis]) * ray[axis]
+            away = positions[joint, axis] - expected[joint, axis]
+            off += away * ray[axis]
+            square += away**2
+        if joint >= 0 and math.isfinite(square + depth + ahead):
+            count += 1
+            across += square - off**2
+            one = (depth + ahead) ** 2 if held else off**2
+            other = (depth - ahead) ** 2 if held else (depth + ahead) ** 2
+            kept += one
+            mirrored += other
+            moved += one > max(other, MOVED**2)
+    return count, moved, kept / count, mirrored / count, across / count
+
+
+@njit(cache=True)
+def _reflect(positions, root, joints, ray, back):
+    """Mirror a limb about the plane through its root across the ray, in place, and mark its observed joints."""
+    for joint in joints:
+        depth = 0.0
+        for axis in range(3):
+            depth += (positions[joint, axis] - positions[root, axis]) * ray[axis]
+        if joint >= 0 and math.isfinite(depth):
+            back[joint] = True
+            for axis in range(3):
+                positions[joint, axis] -= 2 * depth * ray[axis]

@@ -1,0 +1,83 @@
+from dataclasses import replace
+
+import numpy as np
+from tests.helpers.bodies import noisy, waving
+from tests.helpers.values import clean_bodies
+
+from steadypose.msgs.types import JointState
+from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.clean.frame import Estimate
+from steadypose.prior.clean.posture import AT_MOST, LITTLE, SHARE, SPREAD, Posture
+from steadypose.prior.clean.settings import PostureSettings
+from steadypose.prior.models.posture import LivePosture
+from steadypose.prior.sim.noise import time_correlated
+
+FRAMES, SETTLED = 120, 40
+LENGTHS, NOISE = np.linalg.norm(REST_OFFSETS, axis=-1)[None], np.array([0.02])
+CERTAIN, NEVER = np.ones(1), np.zeros((1, 22), dtype=bool)
+
+
+def _positions(seen: np.ndarray, enabled: bool = True) -> np.ndarray:
+    return np.array([body.positions for body in clean_bodies(seen, posture={"enabled": enabled})])
+
+
+def _estimate(off: np.ndarray, sigma: float) -> Estimate:
+    """Of a body at rest, moved by ``off`` (22, 3)."""
+    positions, turns = (REST_POSITIONS + off)[None], np.broadcast_to(np.eye(3), (1, 22, 3, 3))
+    state = np.full((1, 22), JointState.REFINED, dtype=np.uint8)
+    return Estimate(0.0, positions, turns, REST_OFFSETS[None], np.full((1, 22), sigma), state)
+
+
+def test_an_error_that_lasts_gets_smaller() -> None:
+    truth = waving(FRAMES)
+    seen = truth + time_correlated(np.random.default_rng(0).normal(0.0, 0.02, truth.shape), 0.95)
+    on, off = (np.linalg.norm(_positions(seen, on) - truth, axis=-1)[SETTLED:].mean() for on in (True, False))
+    assert on < 0.9 * off
+
+
+def test_a_perfect_input_stays() -> None:
+    truth = waving(FRAMES)
+    np.testing.assert_allclose(_positions(truth)[SETTLED:], truth[SETTLED:], atol=1e-5)
+
+
+def test_joints_move_a_share_of_the_way_and_are_then_surer_but_hidden_ones_are_not() -> None:
+    before = _estimate(np.random.default_rng(1).normal(0.0, 0.02, (22, 3)), 0.02)
+    before.state[0, J["left_wrist"]] = JointState.IMPUTED
+    stage = Posture(PostureSettings())
+    after = stage.update(before, LENGTHS, NOISE, CERTAIN, NEVER)
+    whole = LivePosture.load("default", SPREAD)(before.positions, before.sigma, LENGTHS).positions - before.positions
+    np.testing.assert_allclose(after.positions - before.positions, SHARE * whole, rtol=0.03, atol=1e-4)
+    assert np.linalg.norm(after.positions - REST_POSITIONS, axis=-1).mean() < 0.033
+    surer = after.sigma < before.sigma
+    assert not surer[0, J["left_wrist"]]
+    again = stage.update(before, LENGTHS, NOISE, CERTAIN, ~NEVER).positions == before.positions
+    assert again[0, J["left_wrist"]].all(), "between two observations"
+    assert again.sum() == 3
+    assert surer.sum() == 21
+
+
+def test_in_little_white_noise_joints_hardly_move_however_unsure_the_smoother_is() -> None:
+    before = _estimate(np.random.default_rng(2).normal(0.0, 0.02, (22, 3)), 0.03)
+    little = np.array([0.2 * LITTLE / AT_MOST])
+    for lasting, low, high in ((0.0, 0.0, 0.001), (1.0, 0.005, 0.1)):
+        after = Posture(PostureSettings()).update(before, LENGTHS, little, np.array([lasting]), NEVER)
+        assert low < np.linalg.norm(after.positions - before.positions, axis=-1).max() < high
+
+
+def test_a_slot_without_a_body_stays_empty() -> None:
+    body = _estimate(np.full((22, 3), 0.01), 0.02)
+    twice = {name: np.concatenate([getattr(body, name)] * 2) for name in vars(body) if name != "stamp_s"}
+    both = replace(body, **twice)
+    both.positions[1], both.sigma[1] = np.nan, np.inf
+    after = Posture(PostureSettings()).update(
+        both, np.concatenate([LENGTHS, LENGTHS]), np.full(2, 0.02), np.ones(2), np.zeros((2, 22), dtype=bool)
+    )
+    assert np.isnan(after.positions[1]).all()
+    assert np.isinf(after.sigma[1]).all()
+    alone = Posture(PostureSettings()).update(body, LENGTHS, NOISE, CERTAIN, NEVER)
+    np.testing.assert_array_equal(after.positions[0], alone.positions[0])
+
+
+def test_it_is_off_when_it_is_switched_off() -> None:
+    seen = noisy(FRAMES, 0.02)
+    assert np.abs(_positions(seen) - _positions(seen, enabled=False)).max() > 0.005
