@@ -187,9 +187,7 @@ class CleanCore:
         )
         if self._posture:
             noise = np.hypot(newest.gated.jitter, newest.bias.bias_sigma)
-            estimate = self._posture.update(
-                estimate, newest.bias.lengths, noise, newest.lasting, self._history.seen_since(back)
-            )
+            estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         if self._orient:
             estimate = self._orient.update(estimate)

@@ -151,10 +151,12 @@ class OccludedJoints:
         weighed = self._weigh(slots, occluded, candidates, sigmas, sigma, unseen_s, seen_later)
         share = np.clip((unseen_s[occluded] - FORGETTING_S[0]) / (FORGETTING_S[1] - FORGETTING_S[0]), 0.0, 1.0)
         forgotten = np.hypot(weighed.sigma, share * completed_sigma[occluded])
+        # the network's deviation of a joint between two observations is twice its error; the filters' is nearer
+        between = np.where(seen_later[occluded], np.minimum(forgotten, bridged_sigma[occluded]), forgotten)
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, placed[never]]),
-            np.concatenate([forgotten, (_of_unseen_limbs(never) * completed_sigma)[never]]),
+            np.concatenate([between, (_of_unseen_limbs(never) * completed_sigma)[never]]),
         )
 
     def _place_arms(

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from steadypose.msgs.types import JointState
-from steadypose.prior.arrays import Bools, Floats
+from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.frame import Estimate
 from steadypose.prior.clean.settings import PostureSettings
 from steadypose.prior.models.posture import LivePosture
@@ -41,9 +41,7 @@ class Posture:
     def __init__(self, settings: PostureSettings) -> None:
         self._posture = LivePosture.load(settings.weights, SPREAD)
 
-    def update(
-        self, estimate: Estimate, lengths: Floats, noise: Floats, lasting: Floats, seen_later: Bools
-    ) -> Estimate:
+    def update(self, estimate: Estimate, lengths: Floats, noise: Floats, lasting: Floats) -> Estimate:
         """Return the estimate with joints, and deviations of observed ones, given the whole body.
 
         Args:
@@ -51,8 +49,6 @@ class Posture:
             lengths: (S, 22) metres, length of each joint's bone.
             noise: (S,) metres along an axis, the sensor's jitter and bias, estimated from each body.
             lasting: (S,) certainty that this noise lasts, from 0 to 1.
-            seen_later: (S, 22) whether each joint is observed later within the delay. If hidden now, it is interpolated
-                and stays: far better known than its deviation says.
         """
         slots = np.flatnonzero(np.isfinite(estimate.positions).all(axis=(1, 2)))
         if not len(slots):
@@ -64,7 +60,7 @@ class Posture:
         limited = sure * stated + (1.0 - sure) * np.minimum(stated, np.square(AT_MOST * noise[slots, None]))
         variance = np.where(observed, limited, stated)
         expected = self._posture(positions[slots], np.sqrt(variance), lengths[slots])
-        share = SHARE * variance / (variance + LITTLE**2) * (observed | ~seen_later[slots])
+        share = SHARE * variance / (variance + LITTLE**2)
         positions[slots] += share[..., None] * (expected.positions - positions[slots])
         # errors of a hidden joint are less like the Gaussian's
         sigma[slots] += np.where(observed, share * np.minimum(expected.sigma - sigma[slots], 0.0), 0.0)
