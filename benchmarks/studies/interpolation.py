@@ -21,6 +21,7 @@ from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distan
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.studies.interpolation_noise import in_noise
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import (
@@ -32,7 +33,7 @@ from steadypose.prior.body.kinematics import (
     yaw_matrix,
 )
 from steadypose.prior.body.skeleton import JOINTS
-from steadypose.prior.complete.body import Fill
+from steadypose.prior.complete.body import Fill, complete
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.optimise import Optimiser
 from steadypose.prior.models.completer import LiveCompleter
@@ -107,6 +108,7 @@ def run(bench: Bench) -> Result:
         "slerp and lerp, joints given": from_joints(inbetween.slerp_and_lerp, completer),
         JOINTS_GIVEN: from_joints(inbetween.cubic_spline, completer),
         "completer": lambda positions, rotations, offsets: completer(positions, offsets),
+        "complete": by_command(completer),
     }
     records: list[dict[str, Any]] = []
     for gap in bench.progress.track(GAPS, description="interpolation"):
@@ -119,13 +121,11 @@ def run(bench: Bench) -> Result:
             records.append({"method": name, "gap": gap, **measure(truth, rotations, root, deviation)})
     relate(records)
     searches = search(bench, clips, completer, deviation)
+    noisy, noisy_table = in_noise(bench, PartsCompleter(completer))
     source = {**clips.source, "gaps": GAPS, "known before and after": (BEFORE, AFTER)}
     return Result(
-        [
-            _table(records, len(clips.offsets)),
-            _search_table(searches),
-        ],
-        {"data": source, "records": records, "searches": searches},
+        [_table(records, len(clips.offsets)), _search_table(searches), noisy_table],
+        {"data": source, "records": records, "searches": searches, "noisy": noisy},
     )
 
 
@@ -136,6 +136,17 @@ def from_joints(method: inbetween.InBetween, completer: LiveCompleter) -> inbetw
     def fill(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
         solved = solved_rotations(positions, np.broadcast_to(offsets[:, None], positions.shape), usual)[0]
         return method(positions, solved, offsets)
+
+    return fill
+
+
+def by_command(completer: LiveCompleter) -> inbetween.InBetween:
+    """Return what `steadypose complete` makes of each clip: the completer and splines of joints."""
+    parts = PartsCompleter(completer)
+
+    def fill(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
+        done = [complete(parts, *clip) for clip in zip(positions, offsets, strict=True)]
+        return np.stack([each.rotations for each in done]), np.stack([each.positions[:, 0] for each in done])
 
     return fill
 

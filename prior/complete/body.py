@@ -1,8 +1,9 @@
 """Completion of a recording: motion between key frames (in-betweening), and unobserved parts of a body.
 
 Known joints do not change, bit for bit. The completer estimates the rest with the person's bones, window by window
-(`views`). Windows overlap, and each gap lies in one window with both its ends. Measured bone lengths vary, so known
-joints are a few millimetres off these bones. This residual is interpolated between known frames.
+(`views`). Windows overlap, and each gap lies in one window with both its ends. The completer gets known joints smoothed
+(`_smoothed`), because a velocity from noisy joints throws a body off course in a gap. Measured bone lengths vary, so
+known joints are a few millimetres off these bones. This residual is interpolated between known frames.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.models.completer_features import draw_line, rotations_of_6d
+from steadypose.prior.models.mixture.inference import MixtureSmoother
+from steadypose.prior.timing.rate import FPS
 
 MIN_SIGMA = 0.002
 """Least standard deviation of a given joint along an axis, metres."""
@@ -38,6 +42,14 @@ AROUND = 7
 
 LONGEST = LONGEST_GAP + 2 * AROUND
 """Longest window, frames."""
+
+WHOLE, PART = (0.5, 60.0), (0.8, 40.0)
+"""Share of each joint's own cubic spline in short gaps, and length of gaps without it, frames: where no joint is known,
+and where others are. The completer's errors accumulate along limbs, and those of noisy joints count many times."""
+
+LAG, RUN = 8, 6
+"""Number of later frames from which a known joint is smoothed, and of known frames in a row below which it is not: of
+key frames apart, a smoother takes motion for noise."""
 
 _HOP = 32
 
@@ -144,17 +156,50 @@ def _completed(
 ) -> tuple[Floats, Floats]:
     """Return joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near known frames."""
     known = finite_joints(positions)
-    bridged = _bridged(fill, positions, offsets)
+    smooth = _smoothed(positions)
+    bridged = _bridged(fill, smooth, offsets)
     rotations, root = _filled(fill, bridged, offsets, advanced)
     placed = place_joints(rotations, offsets) + root[:, None]
-    missed = _faded(np.where(known[..., None], positions - placed, 0.0), known)
+    missed = _faded(np.where(known[..., None], smooth - placed, 0.0), known)
     joints = np.where(known[..., None], positions, placed + missed)
     bent = (~known).any(axis=1) & (np.linalg.norm(missed, axis=-1) > BENT).any(axis=1)
     if bent.any():
         joints[bent] = fit_lengths(joints[bent], offsets, np.where(known[bent], HELD, 1.0))
         joints = np.where(known[..., None], positions, joints)
-        rotations[bent] = solve_rotations(joints[bent], offsets, rotations[bent])
+    share, line = _line(smooth, known)
+    joints += share[..., None] * (line - joints)
+    moved = bent | (share > 0).any(axis=1)
+    if moved.any():
+        rotations[moved] = solve_rotations(joints[moved], offsets, rotations[moved])
     return joints, rotations
+
+
+def _line(smooth: Floats, known: Bools) -> tuple[Floats, Floats]:
+    """Return the share (T, 22) of each joint's own cubic spline in its position, and the spline (T, 22, 3), metres."""
+    since, until = frames_since_and_until(known)
+    gap = np.where(known, np.inf, since + until - 1.0)
+    most, longest = np.where(np.asarray(known.any(axis=1))[:, None, None], PART, WHOLE).transpose(2, 0, 1)
+    share = most * np.maximum(1.0 - gap / longest, 0.0)
+    line, times = np.zeros(smooth.shape), np.arange(len(smooth))
+    for joint in np.flatnonzero((share > 0).any(axis=0)):
+        rows = np.flatnonzero(known[:, joint])
+        line[:, joint] = CubicSpline(rows, smooth[rows, joint], bc_type="natural")(times)
+    return share, line
+
+
+def _smoothed(positions: Floats) -> Floats:
+    """Return known joints (T, 22, 3) as the live smoother estimates them, which leaves noise-free ones unchanged."""
+    smoother, known = MixtureSmoother(LAG, 1), finite_joints(positions)
+    lagging = [
+        smoother.update(frame[None], t / FPS, seen[None].astype(np.float64))
+        for t, (frame, seen) in enumerate(zip(positions, known, strict=True))
+    ]
+    smoothed = [frame for frame in lagging if frame is not None] + smoother.flush()
+    since, until = frames_since_and_until(np.pad(~known, ((1, 1), (0, 0)), constant_values=True))
+    in_a_row = (since + until - 1.0)[1:-1]
+    return np.where(
+        (known & (in_a_row >= RUN))[..., None], np.concatenate([frame.positions for frame in smoothed]), positions
+    )
 
 
 def _faded(missed: Floats, known: Bools) -> Floats:

@@ -10,12 +10,13 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.complete import parts
+from steadypose.prior.complete import body, parts
 from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.root_velocity import NewestMotion
+from steadypose.prior.sim.noise import time_correlated
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 
@@ -33,7 +34,7 @@ class Oracle:
         frames = np.flatnonzero(known.any(axis=1))
         joints = known[frames].argmax(axis=1)
         at = [
-            int(np.flatnonzero((self.positions[:, joint] == seen[0, frame, joint]).all(axis=-1))[0])
+            int(np.linalg.norm(self.positions[:, joint] - seen[0, frame, joint], axis=-1).argmin())
             for frame, joint in zip(frames, joints, strict=True)
         ]
         ends = np.concatenate([[at[0] - frames[0]], at, [at[-1] + len(known) - 1 - frames[-1]]])
@@ -77,7 +78,9 @@ def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of
         (slice(0, 20), slice(None)),  # the beginning
     ],
 )
-def test_who_knows_the_motion_gives_it_back(hidden: tuple) -> None:
+def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
+    for share in ("WHOLE", "PART"):  # splines do not know it
+        monkeypatch.setattr(body, share, (0.0, 1.0))
     positions = waving(300)
     seen = positions.copy()
     seen[hidden] = np.nan
@@ -182,3 +185,41 @@ def test_a_way_is_read_from_motion_and_meets_its_ends() -> None:
     met = bridge(Walks(), centred, facing, ends)  # type: ignore[arg-type]
     assert np.allclose(met[[0, -1]], ends[[0, -1]])
     assert np.allclose(met[30], [1.0, 0.5, 0.0])
+
+
+@pytest.mark.parametrize("away", [slice(None), [J["left_shoulder"], J["left_elbow"], J["left_wrist"]]])
+def test_noise_does_not_throw_a_body_off_course_in_a_gap(away: slice | list[int]) -> None:
+    truth = waving(150)
+    seen = truth + np.random.default_rng(0).normal(0.0, 0.01, truth.shape)
+    seen[60:75, away] = np.nan
+    done = complete(PartsCompleter(LiveCompleter.load("default")), seen, REST_OFFSETS)
+    assert np.linalg.norm(done.positions - truth, axis=-1)[60:75, away].mean() < 0.03
+    known = np.isfinite(seen)
+    np.testing.assert_array_equal(done.positions[known], seen[known])
+
+
+def test_short_gaps_are_nearer_to_each_joints_spline_than_long_ones() -> None:
+    positions, off = waving(300), []
+
+    class Raised(Oracle):
+        """A completer that is 10 cm too high."""
+
+        def __call__(self, seen: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rotations, root = super().__call__(seen, offsets)
+            return rotations, root + np.where(np.isfinite(seen).all(axis=(-1, -2)), 0.0, 0.1)[..., None] * (0, 0, 1)
+
+    for gap in (6, 30, 60):
+        seen = positions.copy()
+        seen[100 : 100 + gap] = np.nan
+        done = complete(Raised(positions), seen, REST_OFFSETS)
+        off.append((done.positions - positions)[100 + gap // 2, 0, 2])
+    np.testing.assert_allclose(off, (0.055, 0.075, 0.1), atol=0.006)
+
+
+def test_errors_that_last_do_not_throw_an_arm_off_course_in_a_short_gap() -> None:
+    truth, arm = waving(150), [J["left_shoulder"], J["left_elbow"], J["left_wrist"]]
+    noise = time_correlated(np.random.default_rng(0).normal(0.0, 0.02, truth.shape), 0.95)
+    seen = truth + noise
+    seen[60:66, arm] = np.nan
+    done = complete(PartsCompleter(LiveCompleter.load("default")), seen, REST_OFFSETS)
+    assert np.linalg.norm(done.positions - truth, axis=-1)[60:66, arm].mean() < 0.05
