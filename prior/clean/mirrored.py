@@ -3,7 +3,8 @@
 An image hardly shows whether an arm points to the camera or away from it, so estimators of depth mistake the sign of a
 limb's depth relative to its root, for seconds. Most mirrored limbs are possible poses with the right bone lengths. But
 the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back. The end
-is found by the same test. Near the image plane neither is seen, so no limb is mirrored back for long.
+is found by the same test. Near the image plane neither is seen, so no limb is mirrored back for long. Neither is seen
+in a limb that was hidden, because nobody knows where it went: such a limb is believed.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ BETTER = 0.5
 MEMORY, FIRST = 20, 10
 """Length of the running mean square of that distance, and number of frames before a limb is judged."""
 
+IN_A_ROW = 3
+"""Number of frames for which a joint must have been observed before its prediction is believed, and for which a limb
+must be hidden before its fault is over."""
+
 LONGEST, REMEMBERED = 30, 300
 """Longest time for which a limb is mirrored back, and time for which it is remembered that this was given up, frames.
 While it is remembered, the next onset is taken for the end of the fault."""
@@ -49,10 +54,11 @@ class MirroredLimbs:
         self._square = np.zeros((slots, len(_LIMBS)))
         self._frames = np.zeros((slots, len(_LIMBS)), dtype=np.int64)
         self._since = np.zeros((slots, len(_LIMBS)), dtype=np.int64)
+        self._observed = np.zeros((slots, 22), dtype=np.int64)  # frames in a row; negative, frames hidden
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        for values in (self._square, self._frames, self._since):
+        for values in (self._square, self._frames, self._since, self._observed):
             values[slot] = 0
 
     def update(self, positions: Floats, expected: Floats, camera: Floats) -> tuple[Bools, Bools]:
@@ -68,14 +74,19 @@ class MirroredLimbs:
         """
         back = np.zeros(positions.shape[:2], dtype=np.bool_)
         given_up = np.zeros_like(back)
-        _mirror_back(positions, expected, camera, self._square, self._frames, self._since, back, given_up)
+        seen, rows = np.isfinite(positions[..., 0]), self._observed
+        self._observed = np.where(seen, np.maximum(rows, 0) + 1, np.minimum(rows, 0) - 1)
+        _mirror_back(
+            positions, expected, camera, self._observed, self._square, self._frames, self._since, back, given_up
+        )
         return back, given_up
 
 
 @njit(cache=True)
-def _mirror_back(positions, expected, camera, square, frames, since, back, given_up):
-    """Compute `MirroredLimbs.update`. ``since`` (S, 4) counts the frames for which a limb has been mirrored back;
-    negative, those for which it will still be remembered that this was given up."""
+def _mirror_back(positions, expected, camera, observed, square, frames, since, back, given_up):
+    """Compute `MirroredLimbs.update`. ``observed`` (S, 22) counts the frames in a row in which each joint was observed;
+    negative, hidden. ``since`` (S, 4) counts the frames for which a limb has been mirrored back; negative, those for
+    which it will still be remembered that this was given up."""
     ray = np.empty(3)
     for row in range(len(positions)):
         for limb in range(len(_LIMBS)):
@@ -83,14 +94,19 @@ def _mirror_back(positions, expected, camera, square, frames, since, back, given
             if now != 0:
                 now += 1
             away = _to_limb(positions[row, root], camera, ray)
-            seen, moved, kept, mirrored, across = _distances(positions[row], expected[row], root, joints, ray, now > 0)
+            seen, moved, kept, mirrored, across = _distances(
+                positions[row], expected[row], observed[row], root, joints, ray, now > 0
+            )
             if seen > 0 and away > MIN_RANGE:
                 far = frames[row, limb] >= FIRST and kept > max(LEAST**2, DEVIATIONS**2 * square[row, limb])
                 if far and (now > 0 or moved >= 2) and mirrored + across < BETTER**2 * (kept + across):
                     kept, now = mirrored, 1 if now == 0 else 0
                 frames[row, limb] = min(frames[row, limb] + 1, MEMORY)
                 square[row, limb] += (kept - square[row, limb]) / frames[row, limb]
-            if now > LONGEST:
+            hidden = True
+            for joint in joints:
+                hidden &= joint < 0 or observed[row, joint] <= -IN_A_ROW
+            if now > LONGEST or (now > 0 and hidden):
                 now = -REMEMBERED
                 for joint in joints:
                     given_up[row, joint] |= joint >= 0
@@ -113,9 +129,9 @@ def _to_limb(root, camera, ray):
 
 
 @njit(cache=True)
-def _distances(positions, expected, root, joints, ray, held):
-    """Return how many joints are known, and their mean square distances to predictions, m²: along the ray as believed,
-    along the ray if mirrored, and across it.
+def _distances(positions, expected, observed, root, joints, ray, held):
+    """Return how many joints have a prediction, how many moved, and mean square distances to predictions, m²: along the
+    ray as observed, along the ray if mirrored, and across it.
 
     ``held`` says whether the limb is being mirrored back. What is mirrored is relative to the root, whose noise counts
     too; what is not is more certain by itself.
@@ -129,7 +145,8 @@ def _distances(positions, expected, root, joints, ray, held):
             away = positions[joint, axis] - expected[joint, axis]
             off += away * ray[axis]
             square += away**2
-        if joint >= 0 and math.isfinite(square + depth + ahead):
+        known = joint >= 0 and min(observed[joint], observed[root]) > IN_A_ROW
+        if known and math.isfinite(square + depth + ahead):
             count += 1
             across += square - off**2
             one = (depth + ahead) ** 2 if held else off**2

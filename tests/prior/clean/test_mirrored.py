@@ -10,7 +10,7 @@ from tests.helpers.values import clean_bodies, observation
 
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.gate import Gate
-from steadypose.prior.clean.mirrored import FIRST, LONGEST, REMEMBERED
+from steadypose.prior.clean.mirrored import FIRST, IN_A_ROW, LONGEST, REMEMBERED
 from steadypose.prior.clean.settings import GateSettings
 
 ARM, LEG = ([J[f"left_{name}"] for name in chain] for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
@@ -121,7 +121,7 @@ def test_a_single_joint_shows_no_onset_and_neither_do_the_first_frames() -> None
     alone[:, ARM[0]] = np.nan
     assert not run(alone)[1].any()
     assert not run(mirrored(truth, LEG, slice(FIRST - 2, 70)))[1][:60].any()
-    assert run(mirrored(truth, LEG, slice(FIRST + 1, 40)))[1][FIRST + 1 : 40, LEG].all()
+    assert run(mirrored(truth, LEG, slice(FIRST + IN_A_ROW + 1, 40)))[1][FIRST + IN_A_ROW + 1 : 40, LEG].all()
 
 
 def test_a_forgotten_body_is_not_mirrored_on() -> None:
@@ -130,3 +130,24 @@ def test_a_forgotten_body_is_not_mirrored_on() -> None:
     assert run(spoilt[:50], gate)[1][-1].any()
     gate.forget(np.ones(1, dtype=bool))
     assert not run(spoilt[50:], gate, 50)[1].any()
+
+
+@pytest.mark.parametrize("limb", [ARM, LEG])
+@pytest.mark.parametrize("frames", [1, 3, 8])
+def test_a_limb_that_was_hidden_is_believed_wherever_it_comes_back(limb: list[int], frames: int) -> None:
+    truth = mirrored(seen(90), limb, slice(40 + frames, 90))  # it has moved there
+    truth[40 : 40 + frames, limb] = np.nan
+    passed, faulty = run(truth)
+    assert not faulty.any()
+    np.testing.assert_array_equal(passed[40 + frames + 9 :], truth[40 + frames + 9 :])  # a jump may be refused at first
+
+
+@pytest.mark.parametrize(("frames", "mirrored_back"), [(2, True), (3, False)])
+def test_a_fault_ends_where_its_limb_is_hidden_for_three_frames(frames: int, mirrored_back: bool) -> None:
+    truth = seen(120)
+    spoilt = mirrored(truth, LEG, slice(40, 60))
+    spoilt[50 : 50 + frames, LEG] = np.nan
+    _, faulty = run(spoilt)
+    assert faulty[49, LEG].all()
+    assert faulty[58, LEG].all() == mirrored_back
+    assert not faulty[60:].any(), "its end is no onset"
