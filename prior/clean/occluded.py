@@ -151,8 +151,7 @@ class OccludedJoints:
         weighed = self._weigh(slots, occluded, candidates, sigmas, sigma, unseen_s, seen_later)
         share = np.clip((unseen_s[occluded] - FORGETTING_S[0]) / (FORGETTING_S[1] - FORGETTING_S[0]), 0.0, 1.0)
         forgotten = np.hypot(weighed.sigma, share * completed_sigma[occluded])
-        # the network's deviation of a joint between two observations is twice its error; the filters' is nearer
-        between = np.where(seen_later[occluded], np.minimum(forgotten, bridged_sigma[occluded]), forgotten)
+        between = _of_bridged(forgotten, occluded, seen_later, bridged_sigma, np.where(unseen_s == 0.0, sigma, np.nan))
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, placed[never]]),
@@ -198,6 +197,23 @@ class OccludedJoints:
         features = np.empty((len(body), FEATURES), dtype=np.float32)
         _describe(self._past, slots, body, joint, chosen, deviations, sigma, unseen_s, seen_later, features)
         return self.weigher(Occluded(body, joint, chosen, features))
+
+
+def _of_bridged(stated: Floats, occluded: Bools, seen_later: Bools, bridged: Floats, observed: Floats) -> Floats:
+    """Return the deviations (N,) of ``occluded`` (B, 22) joints, less for those that are observed again.
+
+    The network's deviation, ``stated`` (N,), of a joint between two observations is twice its error. The filters'
+    deviation, ``bridged`` (B, 22), is nearer, but it omits errors that last. These count as much as in the deviations
+    of the body's ``observed`` joints (B, 22), NaN for others.
+    """
+    between = occluded & seen_later
+    if not between.any():
+        return stated
+    row = np.nonzero(between)[0]
+    less = np.maximum(bridged[between], np.nanmedian(observed[row], axis=1))
+    deviations = stated.copy()
+    deviations[between[occluded]] = np.fmin(stated[between[occluded]], less)
+    return deviations
 
 
 def _of_unseen_limbs(never: Bools) -> Floats:
