@@ -56,7 +56,7 @@ def evaluate(
     from steadypose.benchmarks.results import log_reading, show
     from steadypose.nodes.graph.threads import one_thread
 
-    if out is None and not quick and (split == "test" or study in SYSTEMS):
+    if out is None and not quick and (split == "test" or study in (*SYSTEMS, *NO_SPLIT)):
         out = RESULTS
     if out is not None:
         require_committed(out)
