@@ -86,3 +86,12 @@ def test_a_joint_between_two_observations_is_as_sure_as_its_own_filters() -> Non
     stated = np.mean([bodies[t].sigma[wrist] for t in range(62, 66)])
     assert stated < 0.012
     assert off < 1.3 * stated
+
+
+def test_it_is_no_surer_than_the_observed_joints_whose_errors_last() -> None:
+    truth, wrist = waving(FRAMES), J["left_wrist"]
+    seen = truth + time_correlated(np.random.default_rng(0).normal(0.0, 0.02, truth.shape), 0.97)
+    seen[60::12, wrist] = np.nan
+    bodies = clean_bodies(seen)
+    hidden, observed = (np.mean([bodies[t].sigma[wrist] for t in range(at, FRAMES - 4, 12)]) for at in (60, 66))
+    assert hidden > 0.9 * observed > 0.01
