@@ -1,28 +1,21 @@
 """Results that are kept although what they measured has changed since, each with the reason."""
 
 _POSTURE = "joints inform each other since: of validation people, errors that last are 11 % smaller, others up to 4 %"
-_AGAIN = "joints hidden now and observed again within the delay are interpolated since, as before; others are the same"
+_BETWEEN = "joints that are hidden and observed again within the delay are placed and judged differently since"
 _VARIANT = "nothing that it measures has changed: HM-VAE's variant, which it does not run, leaves out a new part"
 
 STALE = {
-    "ablations": _AGAIN,
-    "counter": _AGAIN,
-    "event_mocap": _AGAIN,
-    "events": _AGAIN,
-    "fidelity": _AGAIN,
-    "hidden_joints": "joints observed again within the delay are interpolated since: in gaps of 0.2 s they had 34 mm "
-    "instead of 23, in one source 69",
-    "noisy_joints": _AGAIN,
-    "retarget": _AGAIN,
-    "rotations": _AGAIN,
-    "world": _AGAIN,
-    "completion": _VARIANT,
+    "ablations": f"{_BETWEEN}; it hides few",
+    "noisy_joints": f"{_BETWEEN}; it hides few",
+    "retarget": f"{_BETWEEN}; the streams hide few",
+    "rotations": f"{_BETWEEN}; it hides none but in the bundled streams",
+    "completion": "gaps are filled from smoothed joints and blended with splines since; parts hidden throughout are as before",
     "contacts": _POSTURE,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
     "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
     "people, in noise that lasts, went from 24.3 to 23.5 mm by the first",
-    "interpolation": _VARIANT,
+    "interpolation": "gaps are filled from smoothed joints and blended with splines since",
     "kinect_vicon": "joints inform each other since: of four people, 38.1 to 36.9 mm at a delay of four frames",
     "latency": "joints inform each other since, which takes 0.2 ms a frame",
     "mediapipe": "joints inform each other since: 66.5 to 66.1 mm at a delay of four frames",
