@@ -9,7 +9,7 @@ STALE = {
     "noisy_joints": f"{_BETWEEN}; it hides few",
     "retarget": f"{_BETWEEN}; the streams hide few",
     "rotations": f"{_BETWEEN}; it hides none but in the bundled streams",
-    "completion": "gaps are filled from smoothed joints and blended with splines since; parts hidden throughout are as before",
+    "completion": "gaps are filled from smoothed joints and blended with splines since; hidden parts are as before",
     "contacts": _POSTURE,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
