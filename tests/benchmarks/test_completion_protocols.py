@@ -13,7 +13,7 @@ from steadypose.benchmarks.baselines import inbetween
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.metrics import npss, quaternion_distance
 from steadypose.benchmarks.motion import as_set, simulated_clips
-from steadypose.benchmarks.studies import completion, interpolation
+from steadypose.benchmarks.studies import completion, interpolation, interpolation_noise
 from steadypose.benchmarks.studies.interpolation import BEFORE, Truth, measure, relate
 
 
@@ -85,14 +85,27 @@ def test_the_truth_has_no_error_and_slerp_is_the_unit(truth: Truth) -> None:
 
 def test_both_protocols_run_without_any_data(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(interpolation, "GAPS", (5, 15))
+    monkeypatch.setattr(interpolation_noise, "GAPS", (15,))
     monkeypatch.setattr(completion, "HIDDEN", {"legs": completion.HIDDEN["legs"]})
     with Progress(disable=True) as progress:
         bench = Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress)
         between, parts = interpolation.run(bench), completion.run(bench)
-    assert [table.name for table in between.tables] == ["interpolation", "interpolation-search"]
-    assert len(between.tables[0].rows) == 2 * 8
+    assert [table.name for table in between.tables] == ["interpolation", "interpolation-search", "interpolation-noise"]
+    assert len(between.tables[0].rows) == 2 * 9
     assert [row[:2] for row in between.tables[1].rows[2:]] == [
         ["HM-VAE searched from there", "15"], ["HM-VAE searched from random latents", "15"]
     ]  # fmt: skip
+    noisy = {(r["method"], r["away"]): r["hidden_mm"] for r in between.data["noisy"] if r["noise"] == "white, 1 cm"}
+    for away in interpolation_noise.AWAY:
+        assert noisy["complete", away] < 0.5 * noisy["complete, joints not smoothed first", away]
+        assert noisy["whole-body bank, cubic spline", away] < 0.5 * noisy["cubic spline", away]
     assert {record["method"] for record in parts.data["records"]} >= {"complete", "HG-VAE's completion"}
     assert all(np.isfinite(record["hidden_mm"]) for record in parts.data["records"])
+
+
+def test_a_cubic_motion_is_found_again_by_its_spline() -> None:
+    t = np.linspace(-1.0, 1.0, 30)[:, None, None, None]
+    truth = t**3 + np.arange(2 * 22 * 3).reshape(2, 22, 3) * t
+    seen = truth.copy()
+    seen[10:20, 1] = np.nan
+    np.testing.assert_allclose(interpolation_noise.through(seen), truth, atol=1e-9)
