@@ -6,8 +6,6 @@ _VARIANT = "nothing that it measures has changed: HM-VAE's variant, which it doe
 
 STALE = {
     "ablations": f"{_BETWEEN}; it hides few",
-    "noisy_joints": f"{_BETWEEN}; it hides few",
-    "retarget": f"{_BETWEEN}; the streams hide few",
     "rotations": f"{_BETWEEN}; it hides none but in the bundled streams",
     "completion": "gaps are filled from smoothed joints and blended with splines since; hidden parts are as before",
     "contacts": _POSTURE,
