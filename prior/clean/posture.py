@@ -42,7 +42,7 @@ class Posture:
         self._posture = LivePosture.load(settings.weights, SPREAD)
 
     def update(self, estimate: Estimate, lengths: Floats, noise: Floats, lasting: Floats) -> Estimate:
-        """Return the estimate with joints, and deviations of observed ones, given the whole body.
+        """Return the estimate with joints, and in white noise deviations of observed ones, given the whole body.
 
         Args:
             estimate: of one frame; its deviations may leave out what no joint of the body shows.
@@ -62,6 +62,7 @@ class Posture:
         expected = self._posture(positions[slots], np.sqrt(variance), lengths[slots])
         share = SHARE * variance / (variance + LITTLE**2)
         positions[slots] += share[..., None] * (expected.positions - positions[slots])
-        # errors of a hidden joint are less like the Gaussian's
-        sigma[slots] += np.where(observed, share * np.minimum(expected.sigma - sigma[slots], 0.0), 0.0)
+        # joints of a sensor whose errors last share many of them, so the others tell less than the Gaussian believes
+        surer = (1.0 - sure) * share * np.minimum(expected.sigma - sigma[slots], 0.0)
+        sigma[slots] += np.where(observed, surer, 0.0)  # errors of a hidden joint are less like the Gaussian's
         return replace(estimate, positions=positions, sigma=sigma)

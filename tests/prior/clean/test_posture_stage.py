@@ -40,14 +40,15 @@ def test_a_perfect_input_stays() -> None:
     np.testing.assert_allclose(_positions(truth)[SETTLED:], truth[SETTLED:], atol=1e-5)
 
 
-def test_joints_move_a_share_of_the_way_and_are_then_surer_but_hidden_ones_are_not() -> None:
+def test_joints_move_a_share_of_the_way_and_in_white_noise_those_observed_are_then_surer() -> None:
     before = _estimate(np.random.default_rng(1).normal(0.0, 0.02, (22, 3)), 0.02)
     before.state[0, J["left_wrist"]] = JointState.IMPUTED
     after = Posture(PostureSettings()).update(before, LENGTHS, NOISE, CERTAIN)
     whole = LivePosture.load("default", SPREAD)(before.positions, before.sigma, LENGTHS).positions - before.positions
     np.testing.assert_allclose(after.positions - before.positions, SHARE * whole, rtol=0.03, atol=1e-4)
     assert np.linalg.norm(after.positions - REST_POSITIONS, axis=-1).mean() < 0.033
-    surer = after.sigma < before.sigma
+    np.testing.assert_array_equal(after.sigma, before.sigma, "joints whose errors last share them")
+    surer = Posture(PostureSettings()).update(before, LENGTHS, NOISE, np.zeros(1)).sigma < before.sigma
     assert not surer[0, J["left_wrist"]]
     assert surer.sum() == 21
 
