@@ -56,7 +56,7 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
             [("interpolation", "interpolation", f"{method}, {gap}", column)
              for gap in GAPS for column in ("of slerp's", "of lerp's")],
         ) for row, method in (
-            ("completer, L2Q; L2P", "completer"), ("natural cubic spline", "cubic spline, joints given")
+            ("`complete`, L2Q; L2P", "complete"), ("natural cubic spline", "cubic spline, joints given")
         )
     ),
     (
