@@ -206,7 +206,7 @@ def _of_bridged(stated: Floats, occluded: Bools, seen_later: Bools, bridged: Flo
     deviation, ``bridged`` (B, 22), is nearer, but it omits errors that last. These count as much as in the deviations
     of the body's ``observed`` joints (B, 22), NaN for others.
     """
-    between = occluded & seen_later
+    between = occluded & seen_later & np.isfinite(observed).any(axis=1, keepdims=True)
     if not between.any():
         return stated
     row = np.nonzero(between)[0]

@@ -1,3 +1,4 @@
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -96,3 +97,12 @@ def test_it_is_no_surer_than_the_observed_joints_whose_errors_last() -> None:
     bodies = clean_bodies(seen)
     hidden, observed = (np.mean([bodies[t].sigma[wrist] for t in range(at, FRAMES - 4, 12)]) for at in (60, 66))
     assert hidden > 0.9 * observed > 0.01
+
+
+def test_a_frame_in_which_nothing_is_observed_warns_of_nothing() -> None:
+    seen, wrist = noisy(FRAMES, 0.01), J["left_wrist"]
+    seen[60:64, wrist], seen[62] = np.nan, np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bodies = clean_bodies(seen)
+    assert 0.0 < bodies[62].sigma[wrist] < 0.1
