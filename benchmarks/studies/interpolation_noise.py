@@ -1,4 +1,4 @@
-"""Gaps in noisy recordings: the whole body, or an arm, is away for 5 to 30 frames of a clip.
+"""Gaps in noisy recordings: the whole body, an arm, a wrist or a foot is away for 5 to 30 frames of a clip.
 
 Only joints are given, with noise. Baselines are cubic splines through each joint, as given and as the whole-body bank
 smooths it.
@@ -31,7 +31,12 @@ NOISES: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
     "white, 1 cm": lambda truth, rng: gaussian(truth, 0.01, rng),
     "lasting, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
 }
-AWAY = {"the body": list(range(22)), "an arm": [J["left_shoulder"], J["left_elbow"], J["left_wrist"]]}
+AWAY = {
+    "the body": list(range(22)),
+    "an arm": [J["left_shoulder"], J["left_elbow"], J["left_wrist"]],
+    "a wrist": [J["right_wrist"]],
+    "a foot": [J["right_ankle"], J["right_foot"]],
+}
 
 
 def in_noise(bench: Bench, parts: PartsCompleter) -> tuple[list[dict[str, Any]], Table]:

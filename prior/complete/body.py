@@ -2,26 +2,24 @@
 
 Known joints do not change, bit for bit. The completer estimates the rest with the person's bones, window by window
 (`views`). Windows overlap, and each gap lies in one window with both its ends. The completer gets known joints smoothed
-(`_smoothed`), because a velocity from noisy joints throws a body off course in a gap. Measured bone lengths vary, so
-known joints are a few millimetres off these bones. This residual is interpolated between known frames.
+(`splines.smoothed`), because a velocity from noisy joints throws a body off course in a gap. Measured bone lengths
+vary, so known joints are a few millimetres off these bones. This residual is interpolated between known frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
-from steadypose.prior.models.completer_features import draw_line, rotations_of_6d
-from steadypose.prior.models.mixture.inference import MixtureSmoother
-from steadypose.prior.timing.rate import FPS
+from steadypose.prior.complete.splines import smoothed, splines
+from steadypose.prior.complete.windows import AROUND, LONGEST_GAP, frames_apart, frames_since_and_until, gaps, views
+from steadypose.prior.models.completer_features import rotations_of_6d
+from steadypose.prior.models.line import draw_line
 
 MIN_SIGMA = 0.002
 """Least standard deviation of a given joint along an axis, metres."""
@@ -33,25 +31,6 @@ DRIFT, MAX_DRIFT, LONG = 0.0045, 0.14, 60.0
 """Drift of a body in a gap without the pelvis: metres along an axis per frame from the gap's nearer end, maximum in
 metres, and length of gaps with the full drift in frames. In shorter gaps, drift is proportional to their length. Values
 are from validation people, whose RMS drift reaches 135 mm."""
-
-LONGEST_GAP = 64
-"""Longest gap on which the completer is trained, frames."""
-
-AROUND = 7
-"""Context of a window on each side of a gap, if the recording has it, frames."""
-
-LONGEST = LONGEST_GAP + 2 * AROUND
-"""Longest window, frames."""
-
-WHOLE, PART = (0.5, 60.0), (0.8, 40.0)
-"""Share of each joint's own cubic spline in short gaps, and length of gaps without it, frames: where no joint is known,
-and where others are. The completer's errors accumulate along limbs, and those of noisy joints count many times."""
-
-LAG, RUN = 8, 6
-"""Number of later frames from which a known joint is smoothed, and of known frames in a row below which it is not: of
-key frames apart, a smoother takes motion for noise."""
-
-_HOP = 32
 
 
 @dataclass(frozen=True)
@@ -85,19 +64,6 @@ class Uncertainty:
         drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MAX_DRIFT)
         guessed = np.hypot(guessed, drift)
         return np.where(known, noise, guessed)
-
-
-def frames_apart(known: NDArray[np.bool_]) -> Floats:
-    """(T, K) frames to the nearest frame in which each column is ``known`` (T, K); infinite if there is none."""
-    return np.minimum(*frames_since_and_until(known))
-
-
-def frames_since_and_until(known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """(T, K) frames since the last and until the next frame in which each column is ``known``; infinite if none."""
-    at = np.arange(len(known), dtype=np.float64)[:, None]
-    before = np.maximum.accumulate(np.where(known, at, -np.inf), axis=0)
-    after = np.minimum.accumulate(np.where(known, at, np.inf)[::-1], axis=0)[::-1]
-    return at - before, after - at
 
 
 Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
@@ -156,7 +122,7 @@ def _completed(
 ) -> tuple[Floats, Floats]:
     """Return joints (T, 22, 3) and rotations (T, 22, 3, 3) of frames that begin and end near known frames."""
     known = finite_joints(positions)
-    smooth = _smoothed(positions)
+    smooth = smoothed(positions)
     bridged = _bridged(fill, smooth, offsets)
     rotations, root = _filled(fill, bridged, offsets, advanced)
     placed = place_joints(rotations, offsets) + root[:, None]
@@ -166,40 +132,12 @@ def _completed(
     if bent.any():
         joints[bent] = fit_lengths(joints[bent], offsets, np.where(known[bent], HELD, 1.0))
         joints = np.where(known[..., None], positions, joints)
-    share, line = _line(smooth, known)
+    share, line = splines(smooth, known)
     joints += share[..., None] * (line - joints)
     moved = bent | (share > 0).any(axis=1)
     if moved.any():
         rotations[moved] = solve_rotations(joints[moved], offsets, rotations[moved])
     return joints, rotations
-
-
-def _line(smooth: Floats, known: Bools) -> tuple[Floats, Floats]:
-    """Return the share (T, 22) of each joint's own cubic spline in its position, and the spline (T, 22, 3), metres."""
-    since, until = frames_since_and_until(known)
-    gap = np.where(known, np.inf, since + until - 1.0)
-    most, longest = np.where(np.asarray(known.any(axis=1))[:, None, None], PART, WHOLE).transpose(2, 0, 1)
-    share = most * np.maximum(1.0 - gap / longest, 0.0)
-    line, times = np.zeros(smooth.shape), np.arange(len(smooth))
-    for joint in np.flatnonzero((share > 0).any(axis=0)):
-        rows = np.flatnonzero(known[:, joint])
-        line[:, joint] = CubicSpline(rows, smooth[rows, joint], bc_type="natural")(times)
-    return share, line
-
-
-def _smoothed(positions: Floats) -> Floats:
-    """Return known joints (T, 22, 3) as the live smoother estimates them, which leaves noise-free ones unchanged."""
-    smoother, known = MixtureSmoother(LAG, 1), finite_joints(positions)
-    lagging = [
-        smoother.update(frame[None], t / FPS, seen[None].astype(np.float64))
-        for t, (frame, seen) in enumerate(zip(positions, known, strict=True))
-    ]
-    smoothed = [frame for frame in lagging if frame is not None] + smoother.flush()
-    since, until = frames_since_and_until(np.pad(~known, ((1, 1), (0, 0)), constant_values=True))
-    in_a_row = (since + until - 1.0)[1:-1]
-    return np.where(
-        (known & (in_a_row >= RUN))[..., None], np.concatenate([frame.positions for frame in smoothed]), positions
-    )
 
 
 def _faded(missed: Floats, known: Bools) -> Floats:
@@ -256,75 +194,3 @@ def _filled(fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[
     rotations[looked_at] = rotations_of_6d(columns[looked_at])
     root = np.where(looked_at[:, None], root / np.maximum(total, 1e-12)[:, None], positions[:, 0])
     return rotations, root
-
-
-class View(NamedTuple):
-    """A window.
-
-    Attributes:
-        start: its first frame.
-        weight: (frames,) weight of its output where windows overlap.
-    """
-
-    start: int
-    weight: Floats
-
-    @property
-    def frames(self) -> slice:
-        return slice(self.start, self.start + len(self.weight))
-
-
-class Gap(NamedTuple):
-    """Frames ``start`` to ``end - 1``, in which no joint is known."""
-
-    start: int
-    end: int
-
-
-def gaps(known: Bools) -> list[Gap]:
-    """Return the runs of frames in which no joint is ``known`` (T, 22)."""
-    blank = np.concatenate([[False], ~known.any(axis=1), [False]]).astype(np.int8)
-    return [Gap(*ends) for ends in zip(*(np.flatnonzero(np.diff(blank) == d) for d in (1, -1)), strict=True)]
-
-
-def views(known: Bools) -> list[View]:
-    """Return windows over all frames with unknown joints (T, 22). No gap may be longer than `LONGEST_GAP`.
-
-    A gap, or several gaps close together, gets its own window, because both ends must lie inside. The other frames get
-    windows that overlap by half.
-    """
-    frames = len(known)
-    own = np.zeros(frames)
-    found: list[View] = []
-    waiting = gaps(known)
-    while waiting:
-        first = max(waiting[0].start - AROUND, 0)
-        taken = 1
-        while taken < len(waiting) and waiting[taken].end + AROUND - first <= LONGEST:
-            taken += 1
-        last = min(waiting[taken - 1].end + AROUND, frames)
-        weight = np.ones(last - first)
-        rise, fall = waiting[0].start - first, last - waiting[taken - 1].end
-        if rise:
-            weight[:rise] = (np.arange(rise) + 1.0) / (rise + 1.0)
-        if fall:
-            weight[-fall:] = (np.arange(fall, 0, -1)) / (fall + 1.0)
-        # a gap of which this window sees only one end is left to the window that contains both
-        for gap in gaps(known[first:last]):
-            if not any(gap.start + first == whole.start and gap.end + first == whole.end for whole in waiting[:taken]):
-                weight[gap.start : gap.end] = 0.0
-        found.append(View(first, weight))
-        own[first:last] = np.maximum(own[first:last], weight)
-        waiting = waiting[taken:]
-    for run in _runs(~known.all(axis=1) & (own < 1.0)):
-        first = max(run.start - AROUND, 0)
-        more = max(-(-(run.end - first - LONGEST) // _HOP), 0)
-        for start in range(first, first + more * _HOP + 1, _HOP):
-            end = min(start + LONGEST, frames)
-            weight = np.minimum(np.arange(1, end - start + 1), np.arange(end - start, 0, -1)) / (end - start)
-            found.append(View(start, weight * (1.0 - own[start:end])))
-    return found
-
-
-def _runs(rows: Bools) -> list[Gap]:
-    return gaps(~rows[:, None])

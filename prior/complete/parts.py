@@ -13,10 +13,11 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.models.completer import LiveCompleter
-from steadypose.prior.models.completer_features import correction_share, draw_line
+from steadypose.prior.models.completer_features import correction_share
 from steadypose.prior.models.hgvae.config import SCALE, HGVAEConfig
 from steadypose.prior.models.hgvae.features import body_size, from_tracks, hang_unseen, to_tracks
 from steadypose.prior.models.hgvae.live_completion import LiveCompletion
+from steadypose.prior.models.line import draw_line
 from steadypose.prior.models.weights import WeightsError, load_weights, part
 
 SHARE = 0.8

@@ -22,8 +22,9 @@ from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, load_network, remove_heading, to_6d
-from steadypose.prior.models.completer_features import anchored, draw_line, rotations_of_6d, solved_rotations
+from steadypose.prior.models.completer_features import rotations_of_6d, solved_rotations
 from steadypose.prior.models.hmvae import HMVAEConfig
+from steadypose.prior.models.line import anchored, draw_line
 
 MODEL = "hmvae64"
 """Name of the model's weights."""

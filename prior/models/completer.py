@@ -10,11 +10,11 @@ from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.models.completer_features import (
     BENDS,
     CompleterConfig,
-    anchored,
     correction_share,
     read_window,
     rotations_of_6d,
 )
+from steadypose.prior.models.line import anchored
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 

@@ -9,7 +9,6 @@ vanishes at known frames, so there is no step. In short gaps little is taken fro
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,9 +17,16 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
-from steadypose.prior.body.kinematics import heading, quaternions, rotation_matrices, yaw_matrix
-from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints
+from steadypose.prior.body.kinematics import (
+    from_rotation_vectors,
+    heading,
+    quaternions,
+    rotation_matrices,
+    yaw_matrix,
+)
+from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints, limbs
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.line import Line, draw_line, lerp, write_slerp, write_splines
 from steadypose.prior.timing.rate import FPS
 
 JOINTS = 22
@@ -50,6 +56,7 @@ MAX_BEND = 2.0
 
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]
+_HINGED_LIMBS = np.array(limbs(("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")))
 _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
 
 
@@ -77,24 +84,6 @@ class CompleterConfig:
     def from_dict(cls, config: dict[str, Any]) -> CompleterConfig:
         """Build the configuration from the JSON of a weights file."""
         return cls(**{**config, "never_sigma": tuple(config["never_sigma"])})
-
-
-class Line(NamedTuple):
-    """Interpolation of each track of B windows: here 22 rotations and, last, the root's position.
-
-    Attributes:
-        before: (B, T, 23) index of the last known frame; of the next one if there is none before.
-        after: (B, T, 23) index of the next known frame; of the last one if there is none after.
-        weight: (B, T, 23) float32, interpolation weight from 0 (before) to 1 (after).
-        known: (B, T, 23) whether the frame itself is known.
-        ever: (B, 23) whether any frame is known.
-    """
-
-    before: NDArray[np.int64]
-    after: NDArray[np.int64]
-    weight: Floats32
-    known: Bools
-    ever: Bools
 
 
 class Window(NamedTuple):
@@ -128,8 +117,8 @@ def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple
     unobserved, as with sensors without one, the chest counts as known, and the spine has the mean pose.
 
     Args:
-        positions: (..., 22, 3) metres, z up; NaN where unknown.
-        offsets: (..., 22, 3) metres, bones.
+        positions: (..., T, 22, 3) metres, z up; NaN where unknown.
+        offsets: (22, 3) or (..., T, 22, 3) metres, bones.
         usual: (22, 3, 3) local rotations of the mean pose.
     """
     known = finite_joints(positions)
@@ -148,7 +137,37 @@ def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple
             found[..., joint] &= found[..., PARENTS[joint]]
             for child in children:
                 found[..., joint] &= known[..., child]
+    _interpolate_twist(rotations, found, known, np.broadcast_to(offsets, positions.shape))
     return rotations, found
+
+
+def _interpolate_twist(rotations: Floats, found: Bools, known: Bools, offsets: Floats) -> None:
+    """Interpolate, in place, the twist of upper arms and thighs over frames in which wrist or ankle are unknown.
+
+    The bend of elbow or knee shows the twist, and the forearm's or shank's local rotation is relative to it. Without
+    this, that rotation, interpolated between the known frames, would point elsewhere.
+    """
+    balls, middles, ends = _HINGED_LIMBS.T
+    shape = (-1, found.shape[-2], len(balls))
+    aimed, shown = found[..., balls].reshape(shape), known[..., ends].reshape(shape)
+    told = aimed & shown
+    missing = aimed & ~shown & told.any(axis=1, keepdims=True)
+    if not missing.any():
+        return
+    solved, line = rotations[..., balls, :, :].reshape(*told.shape, 3, 3), draw_line(told)
+    turns, twisted = quaternions(np.where(told[..., None, None], solved, np.eye(3))), np.zeros((*told.shape, 4))
+    write_slerp(turns, line.before, line.after, line.weight, line.ever, np.zeros((len(balls), 4)), twisted)
+    before, bones = rotation_matrices(twisted[missing]), offsets[..., middles, :].reshape(*told.shape, 3)[missing]
+    now, then = (_unit((turn @ bones[..., None])[..., 0]) for turn in (solved[missing], before))
+    axis = np.cross(then, now)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (then * now).sum(axis=-1, keepdims=True))
+    solved[missing] = from_rotation_vectors(axis * (angle / np.maximum(sine, 1e-9))) @ before
+    rotations[..., balls, :, :] = solved.reshape(*found.shape[:-1], len(balls), 3, 3)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
@@ -179,11 +198,11 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
     moved = np.nan_to_num((positions - origin[:, None, None]) @ turn[:, None])
     given[:, :, 22, :3] = moved[:, :, 0]
     curve = np.zeros(given.shape)
-    _slerp(given[:, :, :22], line.before, line.after, line.weight, line.ever, usual, curve[:, :, :22])
+    write_slerp(given[:, :, :22], line.before, line.after, line.weight, line.ever, usual, curve[:, :, :22])
     matrices = rotation_matrices(curve[:, :, :22])
-    path = _lerp(moved[:, :, :1], line, slice(22, 23))[:, :, 0]
+    path = lerp(moved[:, :, :1], line, slice(22, 23))[:, :, 0]
     curve[:, :, 22, :3] = path
-    _splines(given, line.known, curve)
+    write_splines(given, line.known, curve)
     bend = np.zeros((count, frames, 23, 6), dtype=np.float32)
     curve[:, :, :22] /= np.linalg.norm(curve[:, :, :22], axis=-1, keepdims=True)
     bent = rotation_matrices(curve[:, :, :22]) - matrices
@@ -196,15 +215,6 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
     return Window(features, matrices, path, bend, line, turn, origin)
 
 
-def draw_line(known: Bools) -> Line:
-    """Build the line of K tracks from the frames in which each is ``known`` (B, T, K)."""
-    shape = known.shape
-    before, after = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
-    weight = np.zeros(shape, dtype=np.float32)
-    _neighbours(known, before, after, weight)
-    return Line(before, after, weight, known, np.asarray(known.any(axis=1)))
-
-
 def correction_share(line: Line) -> Floats32:
     """(B, T, K, 1) share of what a network adds to the cubic: that of `SHARE_FRAMES`, and 1 if a track is known on one
     side only or never.
@@ -213,117 +223,12 @@ def correction_share(line: Line) -> Floats32:
     return np.where(length > 0, np.minimum(length / SHARE_FRAMES, 1.0), 1.0).astype(np.float32)
 
 
-def _lerp(values: Floats, line: Line, tracks: slice) -> Floats:
-    """(B, T, K, d) values interpolated along the line between known frames; 0 for tracks that are never known."""
-    first = np.take_along_axis(values, line.before[..., tracks, None], axis=1)
-    second = np.take_along_axis(values, line.after[..., tracks, None], axis=1)
-    weight = line.weight[..., tracks, None]
-    return np.where(line.ever[:, None, tracks, None], (1 - weight) * first + weight * second, 0.0)
-
-
-def anchored(values: Floats, line: Line, tracks: slice) -> Floats:
-    """Subtract from a network's output (B, T, K, d) for these tracks the line through its values at known frames."""
-    return values - _lerp(values, line, tracks)
-
-
 def rotations_of_6d(x: NDArray[Float]) -> NDArray[Float]:
     """Convert first two columns (..., 6) to rotations (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019)."""
     first = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
     second = x[..., 3:] - (first * x[..., 3:]).sum(axis=-1, keepdims=True) * first
     second /= np.linalg.norm(second, axis=-1, keepdims=True)
     return np.stack([first, second, np.cross(first, second)], axis=-1)
-
-
-@njit(cache=True)
-def _neighbours(known, before, after, weight):
-    count, frames, tracks = known.shape
-    for row in range(count):
-        for k in range(tracks):
-            last = -1
-            for t in range(frames):
-                if known[row, t, k]:
-                    last = t
-                before[row, t, k] = last
-            last = -1
-            for t in range(frames - 1, -1, -1):
-                if known[row, t, k]:
-                    last = t
-                after[row, t, k] = last
-            for t in range(frames):
-                a, b = before[row, t, k], after[row, t, k]
-                if a < 0 and b < 0:
-                    before[row, t, k] = after[row, t, k] = 0
-                elif a < 0:
-                    before[row, t, k] = b
-                elif b < 0:
-                    after[row, t, k] = a
-                elif b > a:
-                    weight[row, t, k] = (t - a) / (b - a)
-
-
-@njit(cache=True)
-def _splines(values, known, out):
-    """Write the natural cubic spline through a track's known frames between them, if there are more than two.
-
-    All tracks but the last are quaternions, each with the sign that is nearer to the one before.
-    """
-    count, frames, tracks, size = values.shape
-    at, q = np.empty(frames, np.int64), np.empty((frames, size))
-    above, curve = np.empty(frames), np.empty(frames)
-    for row in range(count):
-        for k in range(tracks):
-            knots = 0
-            for t in range(frames):
-                if known[row, t, k]:
-                    q[knots] = values[row, t, k]
-                    if knots > 0 and k < tracks - 1 and (q[knots] * q[knots - 1]).sum() < 0:
-                        q[knots] *= -1.0
-                    at[knots] = t
-                    knots += 1
-            if knots < 3 or knots == frames:
-                continue
-            for i in range(size):
-                # second derivatives at the knots, 0 at the first and last: a tridiagonal system, by elimination
-                above[0] = curve[0] = curve[knots - 1] = 0.0
-                for n in range(1, knots - 1):
-                    left, right = at[n] - at[n - 1], at[n + 1] - at[n]
-                    pivot = 2.0 * (left + right) - left * above[n - 1]
-                    above[n] = right / pivot
-                    turn = (q[n + 1, i] - q[n, i]) / right - (q[n, i] - q[n - 1, i]) / left
-                    curve[n] = (6.0 * turn - left * curve[n - 1]) / pivot
-                for n in range(knots - 2, 0, -1):
-                    curve[n] -= above[n] * curve[n + 1]
-                for n in range(knots - 1):
-                    length = at[n + 1] - at[n]
-                    for t in range(at[n] + 1, at[n + 1]):
-                        s = (t - at[n]) / length
-                        bend = ((1 - s) ** 3 - 1 + s) * curve[n] + (s**3 - s) * curve[n + 1]
-                        out[row, t, k, i] = (1 - s) * q[n, i] + s * q[n + 1, i] + bend * length * length / 6.0
-
-
-@njit(cache=True)
-def _slerp(q, before, after, weight, ever, usual, out):
-    count, frames, joints = q.shape[:3]
-    for row in range(count):
-        for t in range(frames):
-            for j in range(joints):
-                if not ever[row, j]:
-                    out[row, t, j] = usual[j]
-                    continue
-                a, b = q[row, before[row, t, j], j], q[row, after[row, t, j], j]
-                cos = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
-                sign = 1.0 if cos >= 0 else -1.0
-                angle = math.acos(min(abs(cos), 1.0))
-                w = weight[row, t, j]
-                first, second = 1.0 - w, w
-                if angle > 1e-4:
-                    first, second = math.sin(first * angle) / math.sin(angle), math.sin(w * angle) / math.sin(angle)
-                length = 0.0
-                for i in range(4):
-                    out[row, t, j, i] = first * a[i] + sign * second * b[i]
-                    length += out[row, t, j, i] ** 2
-                for i in range(4):
-                    out[row, t, j, i] /= math.sqrt(length)
 
 
 @njit(cache=True)

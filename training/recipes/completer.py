@@ -33,11 +33,11 @@ from steadypose.prior.models.completer_features import (
     OUTPUTS,
     Bools,
     CompleterConfig,
-    Line,
     Window,
     correction_share,
     read_window,
 )
+from steadypose.prior.models.line import Line
 from steadypose.training.data.dataset import (
     MotionSet,
     SpeedWeightedWindows,
@@ -49,7 +49,7 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 
 class Completer(nn.Module):
-    """Correction of the line, before it is anchored (`features.anchored`), and gates of the bend."""
+    """Correction of the line, before it is anchored (`line.anchored`), and gates of the bend."""
 
     def __init__(self, config: CompleterConfig) -> None:
         super().__init__()
@@ -235,7 +235,7 @@ def masks(count: int, gap: int, context: int, rng: Rng) -> Bools:
 
 
 def _anchored(values: Tensor, line: Line, tracks: slice) -> Tensor:
-    """`features.anchored`, with gradients."""
+    """`line.anchored`, with gradients."""
 
     def at(frames: NDArray[np.int64]) -> Tensor:
         index = torch.from_numpy(frames[..., tracks, None]).expand_as(values)

@@ -10,10 +10,11 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.complete import body, parts
-from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
+from steadypose.prior.complete import parts, splines
+from steadypose.prior.complete.body import Uncertainty, complete
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
+from steadypose.prior.complete.windows import LONGEST, LONGEST_GAP, frames_apart, gaps, views
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.root_velocity import NewestMotion
 from steadypose.prior.sim.noise import time_correlated
@@ -80,7 +81,7 @@ def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of
 )
 def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
     for share in ("WHOLE", "PART"):  # splines do not know it
-        monkeypatch.setattr(body, share, (0.0, 1.0))
+        monkeypatch.setattr(splines, share, (0.0, 1.0))
     positions = waving(300)
     seen = positions.copy()
     seen[hidden] = np.nan

@@ -23,12 +23,11 @@ from steadypose.prior.models.completer_features import (
     FEATURES,
     SHARE_FRAMES,
     CompleterConfig,
-    anchored,
     correction_share,
-    draw_line,
     read_window,
     solved_rotations,
 )
+from steadypose.prior.models.line import anchored, draw_line
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes.completer import Completer, Truth, masks, predict, train_completer
@@ -164,6 +163,24 @@ def test_rotations_are_known_where_joints_tell_them() -> None:
     assert not sure("left_hip").any(), "the pelvis' frame is gone, and so is what it carries"
     lost = {name for name, j in J.items() if not sure("spine1", "spine2", "spine3")[j]}
     assert not lost & {"left_shoulder", "right_elbow", "neck"}, "sensors that know of no spine show arms all the same"
+
+
+@pytest.mark.parametrize("limb", [("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")])
+def test_a_hidden_hand_or_foot_does_not_twist_the_limb(limb: tuple[str, ...]) -> None:
+    top, middle, end = (J[f"left_{part}"] for part in limb)
+    positions, offsets, usual = np.repeat(waving(40)[25:26], 9, axis=0), REST_OFFSETS, rotation_matrices(USUAL)
+    axis = positions[0, middle] - positions[0, top]
+    bent = np.cross(axis, [0.3, 1.0, 0.2])  # across the limb, in a plane that the rest pose does not have
+    positions[:, end] = positions[:, middle] + bent / np.linalg.norm(bent) * np.linalg.norm(offsets[end])
+    swung = positions.copy()
+    swung[:, middle] += np.linspace(0.0, 0.02, 9)[:, None] * bent
+    swung[:, end] += np.linspace(0.0, 0.02, 9)[:, None] * bent
+    seen = swung.copy()
+    seen[3:6, end] = np.nan
+    told, solved = solved_rotations(swung, offsets, usual)[0][:, top], solved_rotations(seen, offsets, usual)[0][:, top]
+    assert np.allclose(solved[:3], told[:3])
+    off = Rotation.from_matrix(solved @ told.swapaxes(-1, -2)).magnitude()
+    assert np.degrees(off).max() < 1.0
 
 
 def test_windows_of_training_are_of_one_person_and_keep_something() -> None:
