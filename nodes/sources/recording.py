@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import difflib
+import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
@@ -19,12 +22,16 @@ from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, Pose, PoseRaw, RawBody
+from steadypose.nodes.checks.stamps import RATES_HZ
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
+from steadypose.prior.clean.admission import SLOWEST_NS
 from steadypose.prior.settings import nearest
+
+logger = logging.getLogger(__name__)
 
 NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
@@ -128,6 +135,11 @@ def end_of(last: PoseRaw) -> PoseRaw:
 AXES = ("x", "y", "z")
 LATEST_S = 2.0**31
 """Upper bound of a stamp, seconds. ROS 2 stores seconds in an int32."""
+UNITS = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+MISSING = frozenset({"", "nan", "null", "none", "n/a", "na", "#n/a", "-"})
+"""What a cell without a number may contain, in small letters."""
+NOTES = ("skeleton", "up")
+"""Keys of the lines ``# KEY: VALUE``."""
 
 
 class CsvError(ValueError):
@@ -142,30 +154,30 @@ class CsvSource:
         stamp, left_shoulder_x, left_shoulder_y, left_shoulder_z, left_elbow_x, ...
         0.000, 0.183, 1.402, 2.918, 0.301, ...
 
-    ``stamp`` is the capture time in seconds; positions are in metres, empty or ``nan`` where missing. Joints have the
-    names of a layout (`prior.body.layouts`), in any order; joints without columns are unobserved. Optional columns are
-    ``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body. Lines before the header may contain
-    ``# skeleton: NAME``, if the joints' names fit several layouts, and ``# up: z`` (the default), ``y`` or ``-y``.
+    ``stamp`` is the capture time in seconds; positions are in metres, empty or ``nan`` where missing (`MISSING`).
+    Joints have the names of a layout (`prior.body.layouts`), in any order; joints without columns are unobserved.
+    Optional columns are ``JOINT_confidence``, 0 to 1, and ``body``, an integer id of each body; others are ignored.
+    Lines before the header may contain ``# skeleton: NAME``, if the joints' names fit several layouts, and ``# up: z``
+    (the default), ``y`` or ``-y``.
 
-    Unreadable rows are skipped and counted in ``refused``.
+    Unreadable rows are skipped and counted in ``refused``, which names the first of each kind.
 
     Raises:
-        CsvError: the header or all rows are unusable.
+        CsvError: the header or all rows are unusable, or stamps are in another unit.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.refused: Counter[str] = Counter()
-        try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise CsvError(f"{path}: cannot be read as text: {error}") from error
-        notes = [line[1:].partition(":") for line in lines if line.startswith("#")]
-        header = {key.strip(): value.strip() for key, _, value in notes}
-        rows = csv.reader(line for line in lines if line.strip() and not line.startswith("#"))
+        lines = _lines(path)
+        header = _notes(path, lines)
+        numbered = [
+            (number, line) for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")
+        ]
+        rows = csv.reader(line for _, line in numbered)
         try:
             columns = [name.strip() for name in next(rows, [])]
-            cells = list(rows)
+            cells = [(numbered[rows.line_num - 1][0], row) for row in rows]
         except csv.Error as error:
             raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
         if not columns:
@@ -181,7 +193,10 @@ class CsvSource:
             raise CsvError(f"{path}: {error}") from error
         self._frames = self._read(cells, columns)
         if not self._frames:
-            raise CsvError(f"{path}: expected at least one row of numbers after the header, got none that can be read")
+            raise CsvError(
+                f"{path}: expected at least one row of numbers after the header, got none that can be read: "
+                f"{'; '.join(self.refused)}"
+            )
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -193,38 +208,138 @@ class CsvSource:
             )
             yield POSE_RAW, message
 
-    def _read(self, rows: list[list[str]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
-        """Stamp and bodies of each frame, in file order."""
+    def _read(self, rows: list[tuple[int, list[str]]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
+        """Stamp and bodies of each frame, in file order, from the numbers of rows in the file and their cells."""
         positions = _columns(columns, self._skeleton, AXES)
         confidence = _columns(columns, self._skeleton, ("confidence",))
-        stamp, body = columns.index("stamp"), columns.index("body") if "body" in columns else None
-        read: list[tuple[int, RawBody]] = []
-        for row in rows:
+        stamp, body = columns.index("stamp"), columns.index("body") if "body" in columns else -1
+        used = sorted({stamp, body, *positions.flat, *confidence.flat} - {-1})
+        complete = [(number, row) for number, row in rows if len(row) == len(columns)]
+        _check_unit(self.path, [row[stamp] for _, row in complete])
+        refused: dict[str, list[str]] = {}
+        for number, row in rows:
             if len(row) != len(columns):
-                self.refused["rows of another length than the header"] += 1
-                continue
+                where = f"row {number}: {len(row)} cells for {len(columns)} columns"
+                refused.setdefault("rows of another length than the header", []).append(where)
+        read: list[tuple[int, RawBody]] = []
+        numbers = np.full(len(columns) + 1, np.nan)  # the last stands for missing columns, whose index is -1
+        for number, row in complete:
             try:
-                # the NaN at the end stands for missing columns, whose index is -1
-                numbers = np.array([*(float(cell) if cell.strip() else math.nan for cell in row), math.nan])
-                seconds = numbers[stamp]
-                if not 0 <= seconds < LATEST_S:
-                    self.refused["rows without a stamp of 0 s or more"] += 1
-                    continue
-                id = 0.0 if body is None else float(numbers[body])
-                if not id.is_integer():
-                    self.refused["rows of which the body is no whole number"] += 1
-                    continue
-                joints, confidences = numbers[positions], numbers[confidence][:, 0]
-                confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
-                with np.errstate(over="ignore"):
-                    read.append((round(seconds * 1e9), RawBody(int(id), joints, confidences)))
-            except ValueError:
-                self.refused["rows with something else than numbers"] += 1
+                for index in used:
+                    numbers[index] = _number(number, columns[index], row[index])
+                stamp_ns = _stamp_ns(number, float(numbers[stamp]))
+                id = 0 if body == -1 else _id(number, float(numbers[body]))
+            except _RowError as error:
+                refused.setdefault(error.cause, []).append(error.where)
+                continue
+            joints, confidences = numbers[positions], numbers[confidence][:, 0]
+            confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
+            with np.errstate(over="ignore"):
+                read.append((stamp_ns, RawBody(id, joints, confidences)))
+        self.refused.update({f"{cause}, first {where[0]}": len(where) for cause, where in refused.items()})
         return [(stamp_ns, [one for _, one in group]) for stamp_ns, group in groupby(read, key=lambda pair: pair[0])]
+
+
+class _RowError(ValueError):
+    """A row that is no frame: the cause, in the plural, and where."""
+
+    def __init__(self, cause: str, where: str) -> None:
+        super().__init__(cause, where)
+        self.cause, self.where = cause, where
+
+
+def _number(row: int, column: str, cell: str) -> float:
+    """The number in a cell; NaN if it is missing."""
+    text = cell.strip()
+    if text.lower() in MISSING:
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        raise _RowError("rows with something else than numbers", f"row {row}, column {column}: {text[:20]!r}") from None
+
+
+def _stamp_ns(row: int, seconds: float) -> int:
+    if not 0 <= seconds < LATEST_S:
+        raise _RowError("rows without a stamp of 0 s or more", f"row {row}, column stamp: {seconds:.15g}")
+    return round(seconds * 1e9)
+
+
+def _id(row: int, body: float) -> int:
+    if not body.is_integer() or not -(2**31) <= body < 2**31:
+        raise _RowError("rows of which the body is no whole number of 32 bits", f"row {row}, column body: {body:.15g}")
+    return int(body)
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of a text file in UTF-8."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CsvError(f"{path}: cannot be read as text: {error}; save it as UTF-8") from error
+    except OSError as error:
+        raise CsvError(f"{path}: cannot be read as text: {error}") from error
+    if "\0" in text:  # UTF-16 without a mark at its beginning
+        raise CsvError(f"{path}: cannot be read as text: expected UTF-8, got characters of 0; save it as UTF-8")
+    return text.splitlines()
+
+
+def _notes(path: Path, lines: list[str]) -> dict[str, str]:
+    """The values of the lines ``# KEY: VALUE``, by key."""
+    notes = {}
+    for line in lines:
+        if not line.startswith("#"):
+            continue
+        key, colon, value = line[1:].partition(":")
+        key = key.strip().lower()
+        if key in NOTES:
+            notes[key] = value.strip()
+        elif colon and difflib.get_close_matches(key, NOTES, n=1, cutoff=0.75):
+            raise CsvError(f"{path}: expected a line '# skeleton: NAME' or '# up: AXIS', got {line[:40]!r}")
+        elif colon and key.isidentifier():  # a single word: meant as a setting, rather than a remark
+            logger.warning(
+                "%s: the line %r is not used: expected '# skeleton: NAME' or '# up: AXIS'; positions are read as "
+                "metres, stamps as seconds",
+                path,
+                line[:40],
+            )
+    return notes
+
+
+def _check_unit(path: Path, cells: list[str]) -> None:
+    """Check that stamps are seconds. Frames up to `SLOWEST_NS` apart are a slow recording.
+
+    Raises:
+        CsvError: they are in another unit.
+    """
+    stamps = []
+    for cell in cells:
+        with suppress(ValueError):  # of an empty cell, or text: its row is refused
+            stamps.append(float(cell))
+    seconds = np.array(stamps)
+    seconds = seconds[np.isfinite(seconds)]
+    steps = np.abs(np.diff(seconds))
+    steps = steps[steps > 0]  # bodies of one frame share a stamp
+    latest = float(np.median(seconds)) if len(seconds) else 0.0
+    fits: list[str] = []
+    if len(steps) > 1 and (step := float(np.median(steps))) > SLOWEST_NS / 1e9:
+        fits = [unit for unit, factor in UNITS.items() if RATES_HZ[0] <= factor / step <= RATES_HZ[1]]
+    if not fits and latest >= LATEST_S:
+        fits = [unit for unit, factor in UNITS.items() if latest / factor < LATEST_S]
+    if fits:
+        first = ", ".join(f"{value:.15g}" for value in np.unique(seconds)[:3])
+        raise CsvError(
+            f"{path}: stamp: expected seconds, got {first}: these look like {fits[0]}; divide by {UNITS[fits[0]]}"
+        )
 
 
 def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
     """The layout that has all joints of the header."""
+    if len(columns) == 1 and (separators := [character for character in ";\t" if character in columns[0]]):
+        raise CsvError(
+            f"{path}: expected columns separated by commas, got {separators[0]!r} in {columns[0][:40]!r} ...; save it "
+            "with commas, and with points in numbers (0.183)"
+        )
     if "stamp" not in columns:
         raise CsvError(
             f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8]) or 'none'} ...; "
@@ -238,16 +353,32 @@ def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
     if not joints or lone:
         raise CsvError(
             f"{path}: expected columns JOINT_x, JOINT_y and JOINT_z for each joint; "
-            f"{'missing: ' + ', '.join(lone[:5]) if lone else 'got none'}"
+            f"{'missing: ' + ', '.join(lone[:5]) if lone else 'got none among ' + ', '.join(columns[:8])}"
         )
     if named is not None and named not in SKELETONS:
         raise CsvError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {named!r}")
     for skeleton in [SKELETONS[named]] if named else SKELETONS.values():
         if joints <= set(skeleton.joints):
             return skeleton
-    closest = max([SKELETONS[named]] if named else SKELETONS.values(), key=lambda s: len(joints & set(s.joints)))
-    strange = ", ".join(sorted(joints - set(closest.joints))[:5])
-    raise CsvError(f"{path}: expected the joints of one skeleton; {closest.name} is closest, but has no {strange}")
+    spelt = {_plain(joint) for joint in joints}  # the layout is chosen however its names are spelt
+    closest = max(
+        [SKELETONS[named]] if named else SKELETONS.values(),
+        key=lambda s: (len(spelt & {_plain(joint) for joint in s.joints}), len(joints & set(s.joints))),
+    )
+    names = {_plain(joint): joint for joint in closest.joints}
+    strange = [
+        joint + (f" ({names[_plain(joint)]})" if _plain(joint) in names else "")
+        for joint in sorted(joints - set(closest.joints))
+    ]
+    raise CsvError(
+        f"{path}: expected the joints of one skeleton; {closest.name} is closest, but has no {', '.join(strange[:5])}"
+        + ("; rename them to the names in brackets" if any(joint.endswith(")") for joint in strange[:5]) else "")
+    )
+
+
+def _plain(joint: str) -> str:
+    """A joint's name without what programs spell differently: LeftWrist is left_wrist."""
+    return joint.lower().replace("_", "")
 
 
 def _columns(columns: list[str], skeleton: Skeleton, endings: tuple[str, ...]) -> NDArray[np.intp]:

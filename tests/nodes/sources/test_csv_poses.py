@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import walk
 
-from steadypose.msgs.types import PoseRaw
+from steadypose.msgs.types import Pose, PoseRaw
 from steadypose.nodes.sources.recording import CsvError, CsvSource, open_recording
 from steadypose.prior.body.skeleton import JOINTS
 
@@ -72,8 +72,7 @@ def test_a_body_is_a_whole_number_that_fits(tmp_path: Path) -> None:
     source = CsvSource(write(tmp_path / "x.csv", "stamp,body,nose_x,nose_y,nose_z", *rows))
     assert [body.id for _, message in source if isinstance(message, PoseRaw) for body in message.bodies] == [2, -7]
     assert source.refused == {
-        "rows of which the body is no whole number": 4,
-        "rows with something else than numbers": 1,
+        "rows of which the body is no whole number of 32 bits, first row 3, column body: 1.5": 5,
     }
 
 
@@ -92,10 +91,60 @@ def test_rows_that_are_no_frames_are_counted_and_left_out(tmp_path: Path) -> Non
     assert len(source) == 2
     assert len(list(source)) == 2
     assert source.refused == {
-        "rows of another length than the header": 2,
-        "rows with something else than numbers": 2,
-        "rows without a stamp of 0 s or more": 3,
+        "rows of another length than the header, first row 2: 2 cells for 4 columns": 2,
+        "rows with something else than numbers, first row 3, column stamp: 'x'": 2,
+        "rows without a stamp of 0 s or more, first row 4, column stamp: nan": 3,
     }
+
+
+def test_a_row_has_its_number_in_the_file(tmp_path: Path) -> None:
+    lines = ["# up: y", "", "stamp,nose_x,nose_y,nose_z", "0,1,2,3", "", "0.1,1,two,3"]
+    assert list(CsvSource(write(tmp_path / "x.csv", *lines)).refused) == [
+        "rows with something else than numbers, first row 6, column nose_y: 'two'"
+    ]
+
+
+@pytest.mark.parametrize("cell", ["null", "N/A", "nan", "-", "None", "#N/A", " "])
+def test_words_for_a_missing_number_leave_its_joint_unobserved(tmp_path: Path, cell: str) -> None:
+    (frame,) = frames(write(tmp_path / "x.csv", "stamp,nose_x,nose_y,nose_z,nose_confidence", f"0,1,{cell},3,{cell}"))
+    np.testing.assert_array_equal(frame.bodies[0].positions[0], [1, np.nan, 3])
+    assert frame.bodies[0].confidence[0] == 0
+
+
+def test_columns_that_are_not_used_may_contain_text(tmp_path: Path) -> None:
+    source = CsvSource(write(tmp_path / "x.csv", "stamp,person_name,nose_x,nose_y,nose_z", "0,bob,1,2,3"))
+    assert len(source) == 1
+    assert not source.refused
+
+
+@pytest.mark.parametrize(
+    ("start", "step", "expected"),
+    [
+        (0, 100 / 3, "got 0, 33, 67: these look like milliseconds; divide by 1000$"),
+        (1_750_000_000_000, 100 / 12, "got 1750000000000, 1750000000008, .*milliseconds; divide by 1000$"),
+        (0, 1e5 / 3, ".*microseconds; divide by 1000000$"),
+        (0, 1e8 / 3, ".*nanoseconds; divide by 1000000000$"),
+        (1_750_000_000 * 10**9, 1e9, ".*nanoseconds; divide by 1000000000$"),
+    ],
+)
+def test_stamps_in_another_unit_are_refused(tmp_path: Path, start: int, step: float, expected: str) -> None:
+    lines = [f"{start + round(k * step)},{body},1,2,3" for k in range(9) for body in (1, 2)]
+    with pytest.raises(CsvError, match=f"stamp: expected seconds, {expected}"):
+        CsvSource(write(tmp_path / "x.csv", "stamp,body,nose_x,nose_y,nose_z", *lines))
+
+
+@pytest.mark.parametrize("step", [1, 2, 5, 10])
+def test_a_slow_recording_of_whole_seconds_is_read(tmp_path: Path, step: int) -> None:
+    lines = [f"{step * k},1,2,3" for k in range(9)]
+    assert len(CsvSource(write(tmp_path / "x.csv", "stamp,nose_x,nose_y,nose_z", *lines))) == 9
+
+
+def test_remarks_are_no_settings_and_what_seems_one_is_warned_of(tmp_path: Path, caplog) -> None:
+    lines = ["# recorded by hand: the first take", "# UP: y", "# unit: mm", "stamp,nose_x,nose_y,nose_z", "0,1,2,3"]
+    (frame,) = frames(write(tmp_path / "x.csv", *lines))
+    np.testing.assert_array_equal(frame.sensor_pose.orientation, Pose.from_up("y").orientation)
+    (record,) = caplog.records
+    assert "'# unit: mm' is not used: expected '# skeleton: NAME' or '# up: AXIS'" in record.getMessage()
 
 
 @pytest.mark.parametrize(
@@ -103,15 +152,25 @@ def test_rows_that_are_no_frames_are_counted_and_left_out(tmp_path: Path) -> Non
     [
         ([], "has no rows: expected a header, stamp, JOINT_x"),
         (["time,nose_x,nose_y,nose_z"], "expected a header with a column 'stamp', in seconds; got time, nose_x"),
-        (["stamp"], "JOINT_z for each joint; got none"),
+        (["stamp"], "JOINT_z for each joint; got none among stamp"),
+        (
+            ["stamp;nose_x;nose_y;nose_z", "0;1;2;3"],
+            "separated by commas, got ';' in 'stamp;nose_x.*save it with commas",
+        ),
+        (["stamp,Nose_X"], "for each joint; got none among stamp, Nose_X"),
         (["stamp,nose_x,nose_y"], "missing: nose_z"),
         (["stamp,nose_x,nose_y,nose_z,nose_x"], "each column once, got nose_x again"),
         (["stamp,nose_x,nose_y,nose_z,tail_x,tail_y,tail_z"], "is closest, but has no tail"),
+        (["stamp,LeftWrist_x,LeftWrist_y,LeftWrist_z"], "smpl22 is closest, but has no LeftWrist .left_wrist.; rename"),
+        (
+            ["# skelton: smpl22", "stamp,nose_x,nose_y,nose_z"],
+            "expected a line '# skeleton: NAME' .* got '# skelton: smpl",
+        ),
         (["# skeleton: smpl", "stamp,nose_x,nose_y,nose_z"], "skeleton: expected one of smpl22, .* got 'smpl'"),
         (["# skeleton: smpl22", "stamp,nose_x,nose_y,nose_z"], "smpl22 is closest, but has no nose"),
         (["# up: x", "stamp,nose_x,nose_y,nose_z", "0,1,2,3"], "up: expected one of"),
         (["stamp,nose_x,nose_y,nose_z"], "has a header, but no rows"),
-        (["stamp,nose_x,nose_y,nose_z", "a,b,c,d"], "at least one row"),
+        (["stamp,nose_x,nose_y,nose_z", "a,b,c,d"], "at least one row.*row 2, column stamp: 'a'"),
         (["stamp,nose_x,nose_y,nose_z", "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
     ],
 )
@@ -120,9 +179,10 @@ def test_a_csv_that_is_not_poses_says_what_was_expected(tmp_path: Path, lines: l
         CsvSource(write(tmp_path / "x.csv", *lines))
 
 
-def test_bytes_that_are_no_text_say_so(tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00stamp")
-    with pytest.raises(CsvError, match="cannot be read as text"):
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le"])
+def test_bytes_that_are_no_text_say_so(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "x.csv").write_text("stamp,nose_x,nose_y,nose_z\n0,1,2,3\n", encoding)
+    with pytest.raises(CsvError, match=r"cannot be read as text: .*; save it as UTF-8"):
         open_recording(tmp_path / "x.csv")
 
 
