@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from steadypose.msgs.types import Level
 from steadypose.nodes.checks.problem import Arrival, Problem, error, warning
 from steadypose.prior.timing.rate import FPS
 
@@ -19,6 +21,8 @@ SLOW_HZ = 9.0
 UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3, "ticks of 100 ns": 100.0}
 AHEAD_NS = 300_000_000
 """Largest tolerated lead of stamps over this machine's clock, nanoseconds. Two clocks set by hand stay below it."""
+UNSORTED = 2 / 3
+"""Share of stamps older than an earlier one from which no useful output is possible, ratio."""
 STEP_NS = 500_000_000
 """Change of the offset between stamps and clock, from one message to the next, that shows that a clock was set,
 nanoseconds."""
@@ -43,11 +47,17 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
         return
     steps = np.diff(stamps)
     if (steps < 0).sum() > max(1, 0.1 * len(steps)):
-        yield warning(
+        found = warning(
             "stamps_out_of_order",
             f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before: expected "
-            "increasing stamps; publish frames in the order of their capture, from one thread",
+            "increasing stamps; publish frames in the order of their capture, from one thread; in a file sort the rows "
+            "by stamp",
         )
+        # of two threads' frames every other one is late; of an unsorted file's nearly all, and these are not used
+        if (stamps < np.maximum.accumulate(stamps)).mean() > UNSORTED:
+            yield replace(found, level=Level.ERROR)
+            return
+        yield found
     elif (steps == 0).sum() > 0.3 * len(steps):
         yield warning(
             "stamps_repeated",
@@ -95,11 +105,11 @@ def _unit(stamps: np.ndarray) -> Problem | None:
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
     if not step and (rising < 0).any():
         return None  # they decrease
-    if not (stamps % SECOND_NS).any() and (step == 0 or step >= SECOND_NS):
+    if not (stamps % SECOND_NS).any() and (step == 0 or (step >= SECOND_NS and not _stretched(SECOND_NS / step))):
         return error(
             "stamps_whole_seconds",
             f"stamps are whole seconds, the last {newest // SECOND_NS} s: expected nanoseconds of capture; in ROS use "
-            "both stamp.sec and stamp.nanosec, otherwise time.time_ns()",
+            "both stamp.sec and stamp.nanosec, in a CSV decimals (0.033), otherwise time.time_ns()",
         )
     if not step and newest < SECONDS_BELOW:
         return _of_unit("seconds", f"stamp is {newest} in every message", UNITS["seconds"])

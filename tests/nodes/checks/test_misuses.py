@@ -126,6 +126,16 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "microseconds for nanoseconds": (stamp(lambda ns, _: ns // 10**3), "stamps_unit", "multiply by 1000"),
     "a Kinect's ticks for nanoseconds": (stamp(lambda ns, _: ns // 100), "stamps_unit", "ticks of 100 ns"),
     "two threads": (stamp(lambda ns, k: ns + 50_000_000 * (k % 2)), "stamps_out_of_order", "order of their capture"),
+    "rows that are not sorted": (
+        stamp(lambda _, k: START_NS + (37 * k % 90) * SECOND_NS // 30),
+        "stamps_out_of_order",
+        "sort the rows by stamp",
+    ),
+    "whole milliseconds as seconds": (
+        stamp(lambda ns, k: round(k * 1000 / 30) * SECOND_NS),
+        "stamps_unit",
+        "seem to be milliseconds, converted as if they were seconds",
+    ),
     "a message a body": (stamp(lambda ns, k: ns - k % 2 * 33_333_333), "stamps_repeated", "into one message"),
     "a clock that is ahead": (stamp(lambda ns, _: ns + 5 * SECOND_NS), "stamps_ahead", "NTP or PTP"),
     "a clock that is set": (WALL_CLOCK_SET, "clock_jumped", "slew that clock"),
@@ -193,6 +203,20 @@ def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> No
     assert after_s <= SOON_S
     assert words in text
     assert "expected" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "level"),
+    [
+        (lambda ns, k: ns + 50_000_000 * (k % 2), Level.WARN),
+        (lambda _, k: START_NS - k * SECOND_NS // 30, Level.ERROR),
+        (lambda _, k: START_NS + (37 * k % 90) * SECOND_NS // 30, Level.ERROR),
+    ],
+    ids=["two threads", "reversed", "shuffled"],
+)
+def test_of_unsorted_stamps_no_output_is_of_use(change: Callable[[int, int], int], level: Level) -> None:
+    found = told([stamp(change)(raw, index) for index, raw in enumerate(walk())], live=False)
+    assert found["stamps_out_of_order"][1] == level
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS)
