@@ -1,10 +1,11 @@
 """Limbs mirrored about the image plane: found at the onset, and mirrored back.
 
-An image hardly shows whether an arm points to the camera or away from it, so estimators of depth mistake the sign of a
-limb's depth relative to its root, for seconds. Most mirrored limbs are possible poses with the right bone lengths. But
-the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back. The end
-is found by the same test. Near the image plane neither is seen, so no limb is mirrored back for long. Neither is seen
-in a limb that was hidden, because nobody knows where it went: such a limb is believed.
+An image hardly shows whether an arm points to the camera or away from it, so estimators of depth mistake the sign of
+a limb's depth relative to its root, for seconds. Most mirrored limbs are possible poses with the right bone lengths.
+But the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back.
+The end is found by the same test. If the root is off along the ray too, the whole body jumped. Near the image plane
+neither is seen, so no limb is mirrored back for long. Neither is seen in a limb that was hidden, because nobody knows
+where it went: such a limb is believed.
 """
 
 from __future__ import annotations
@@ -97,7 +98,10 @@ def _mirror_back(positions, expected, camera, observed, square, frames, since, b
             seen, moved, kept, mirrored, across = _distances(
                 positions[row], expected[row], observed[row], root, joints, ray, now > 0
             )
-            if seen > 0 and away > MIN_RANGE:
+            shift = 0.0
+            for axis in range(3):
+                shift += (positions[row, root, axis] - expected[row, root, axis]) * ray[axis]
+            if seen > 0 and away > MIN_RANGE and (now > 0 or abs(shift) < LEAST):
                 far = frames[row, limb] >= FIRST and kept > max(LEAST**2, DEVIATIONS**2 * square[row, limb])
                 if far and (now > 0 or moved >= 2) and mirrored + across < BETTER**2 * (kept + across):
                     kept, now = mirrored, 1 if now == 0 else 0

@@ -74,6 +74,14 @@ def test_an_arm_that_moves_to_the_camera_and_back_is_believed(frames: int, towar
     assert not faulty.any()
 
 
+@pytest.mark.parametrize("shift", [0.4, -0.7])
+@pytest.mark.parametrize("frames", [slice(40, 41), slice(40, 90)])
+def test_a_body_that_jumps_along_the_ray_has_no_limb_mirrored(shift: float, frames: slice) -> None:
+    moved = seen(90)
+    moved[frames] *= 1.0 + shift / np.linalg.norm(moved[40, 0])
+    assert not run(moved)[1].any()
+
+
 @pytest.mark.parametrize("sigma", [0.01, 0.02, 0.04])
 def test_noise_is_no_onset(sigma: float) -> None:
     assert not run(seen(600, sigma))[1].any()
