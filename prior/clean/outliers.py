@@ -208,18 +208,22 @@ def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 @njit(cache=True)
 def _noise(positions):
-    """(22,) metres along an axis, noise from frame to frame of positions (T, 22, 3), from their second differences."""
+    """(22,) metres along an axis, noise from frame to frame of positions (T, 22, 3), from their fourth differences.
+
+    Second differences would contain acceleration, and a foot at rest in a recording without noise would be frozen.
+    """
     frames, joints, _ = positions.shape
     noise = np.empty(joints)
     for joint in range(joints):
         squares, seen = 0.0, 0
-        for t in range(2, frames):
+        for t in range(4, frames):
             square = 0.0
             for axis in range(3):
-                shaken = positions[t, joint, axis] - 2 * positions[t - 1, joint, axis] + positions[t - 2, joint, axis]
+                p = positions[t - 4 : t + 1, joint, axis]
+                shaken = p[0] - 4 * p[1] + 6 * p[2] - 4 * p[3] + p[4]
                 square += shaken * shaken
             if math.isfinite(square):
                 squares += square
                 seen += 3
-        noise[joint] = math.sqrt(squares / 6 / max(seen, 1))
+        noise[joint] = math.sqrt(squares / 70 / max(seen, 1))
     return noise

@@ -89,6 +89,13 @@ def test_what_rests_beside_steady_motion_is_frozen_only_if_the_sensor_has_noise(
     assert np.flatnonzero(frozen_joints(seen[None])[0]).tolist() == ([WRIST] if sigma else [])
 
 
+def test_a_foot_at_rest_in_a_fast_body_without_noise_is_not_frozen() -> None:
+    seen = 0.3 * np.sin(np.arange(50)[:, None, None] / 30 * np.linspace(4.0, 8.0, 22)[:, None] + [0.0, 1.0, 2.0])
+    seen[:, LEG] = seen[0, LEG]
+    assert np.linalg.norm(np.diff(seen, 2, axis=0), axis=-1).max() * 30**2 > 10.0
+    assert not frozen_joints(seen[None]).any()
+
+
 @pytest.mark.parametrize("rounds", [False, True])
 def test_a_sensor_rounds_whose_joints_repeat_coordinates_in_the_frames_that_have_them(rounds: bool) -> None:
     seen = np.random.default_rng(0).normal(0.0, 0.005, (51, 22, 3))
