@@ -100,7 +100,9 @@ def test_a_root_is_as_sure_as_the_pelvis_and_less_so_if_it_is_inferred() -> None
 
     assert root([0, HIPS[0]]).root_sigma == pytest.approx(0.01)
     assert root([0, HIPS[0]]).pelvis_observed
-    inferred = root([0, *HIPS])
+    on_spine = root([0, *HIPS])
+    assert on_spine.root_sigma == pytest.approx(np.hypot(0.01, 0.02)), "the spine carries it"
+    inferred = root([0, *HIPS, J["spine1"]])
     assert inferred.root_sigma == pytest.approx(np.hypot(0.01, 0.05))
     assert (inferred.pelvis_observed, inferred.root_observed) == (False, True)
     assert not root(list(range(22))).root_observed
