@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw
-from steadypose.nodes.checks.problem import Problem, error, tracks, warning
+from steadypose.nodes.checks.problem import Problem, bodies, error, observed, tracks, warning
 from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
@@ -50,6 +50,8 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if len(joints) < ENOUGH:
         return
     if not np.isfinite(joints).any():
+        if any(np.isfinite(body.positions).any() for body in bodies(messages)):
+            return  # all of confidence 0: see `layout`
         yield error(
             "all_missing",
             f"all joints of the last {len(joints)} bodies are NaN: expected metres. Where nobody is, send no body; in "
@@ -57,6 +59,9 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
         )
         return
     if (problem := _degenerate(messages, joints)) is not None:
+        yield problem
+        return
+    if (problem := _zeros(skeleton, joints)) is not None:
         yield problem
         return
     like = likeness(skeleton, joints)
@@ -125,7 +130,7 @@ def _paths(messages: Sequence[PoseRaw]) -> list[tuple[NDArray[np.int64], Floats]
     for raw in messages if skeleton else ():
         for body in raw.bodies:
             if skeleton and len(body.positions) == len(skeleton.joints):
-                rows.setdefault(body.id, []).append((raw.stamp_ns, body.positions))
+                rows.setdefault(body.id, []).append((raw.stamp_ns, observed(body)))
     return [
         (np.array([stamp for stamp, _ in row]), np.array([joints for _, joints in row], np.float64))
         for row in rows.values()
@@ -161,6 +166,19 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
                 "message",
             )
     return None
+
+
+def _zeros(skeleton: Skeleton, joints: Floats) -> Problem | None:
+    """The problem of joints (N, J, 3) that are zero where the sensor has none. A pelvis may be the origin."""
+    zero = (joints == 0.0).all(axis=-1) & ~(skeleton.to_canonical[J["pelvis"]] == 1.0)
+    if not zero.any():
+        return None
+    worst = int(zero.sum(axis=0).argmax())
+    return error(
+        "zeros",
+        f"joints lie exactly at the origin, {skeleton.joints[worst]} in {zero[:, worst].sum()} of the last "
+        f"{len(joints)} bodies: expected NaN, or confidence 0, for a joint that was not found",
+    )
 
 
 def _no_body(skeleton: Skeleton, like: Likeness, joints: Floats) -> Problem:

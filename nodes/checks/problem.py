@@ -102,7 +102,15 @@ def some_bodies(messages: Sequence[PoseRaw]) -> list[PoseRaw]:
 
 
 def tracks(messages: Sequence[PoseRaw], joints: int) -> NDArray[np.float64]:
-    """(N, J, 3) joints of all bodies that have ``joints`` of them; NaN where not finite."""
-    found = [body.positions for body in bodies(messages) if len(body.positions) == joints]
-    stacked = np.array(found, np.float64).reshape(-1, joints, 3)
-    return np.where(np.isfinite(stacked).all(axis=-1, keepdims=True), stacked, np.nan)
+    """(N, J, 3) joints of all bodies that have ``joints`` of them; NaN where unobserved."""
+    found = [observed(body) for body in bodies(messages) if len(body.positions) == joints]
+    return np.array(found, np.float64).reshape(-1, joints, 3)
+
+
+def observed(body: RawBody) -> NDArray[np.float64]:
+    """(J, 3) joints of a body; NaN where not finite or of confidence 0."""
+    positions = body.positions.astype(np.float64)
+    missing = np.asarray(~np.isfinite(positions).all(axis=-1))
+    if len(body.confidence) == len(positions):
+        missing |= body.confidence <= 0.0
+    return np.where(missing[:, None], np.nan, positions)

@@ -91,14 +91,15 @@ def canonical_bodies(
 
 
 def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple[Floats, Floats]:
-    """Return a body's canonical joints in the sensor's frame, without joints that are not finite or too far away."""
+    """Return a body's canonical joints in the sensor's frame, without joints that are unobserved or too far away."""
     joints = body.positions.astype(np.float64)
+    confidence = np.fmin(np.fmax(body.confidence.astype(np.float64), 0.0), 1.0)  # NaN becomes 0
+    joints[confidence == 0.0] = np.nan  # trackers give such joints any position, often the origin
     finite = finite_joints(joints)
     far = finite & (np.abs(np.where(finite[:, None], joints, 0.0)).max(axis=1) > MAX_DISTANCE)
     if far.any():
         counters["joints_too_far"] += int(far.sum())
         joints[far] = np.nan
-    confidence = np.fmin(np.fmax(body.confidence.astype(np.float64), 0.0), 1.0)  # NaN becomes 0
     return to_canonical(layout, joints, confidence)
 
 

@@ -106,6 +106,8 @@ OPTICAL = joints(lambda it: np.stack([-it[:, 1], -it[:, 2], it[:, 0]], axis=1))
 SELFIE = joints(lambda it: it[[CANONICAL.joints.index(_other(name)) for name in CANONICAL.joints]])
 LEANING = joints(lambda it: Rotation.from_rotvec([0.8, -0.8, 0]).apply(it))
 FOUR_SEEN = joints(lambda it: np.where(np.arange(22)[:, None] < 4, it, np.nan))
+WITH_ARMS = (np.arange(22) < 18).astype(np.float32)
+WRIST_ZERO = body(lambda it, k: RawBody(it.id, it.positions * (np.arange(22) != 20 - k % 2)[:, None], it.confidence))
 WALL_CLOCK_SET = stamp(lambda ns, index: ns - 3600 * SECOND_NS * (index > 60))
 ID_A_FRAME = body(lambda it, index: moved(it, 0.0, index))
 ONE_ID_IN_TURN = body(lambda it, index: moved(it, 1.5 * (index % 2)))
@@ -158,6 +160,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "joints relative to the root": (joints(lambda it: it - it[0]), "root_relative", "add the root's place"),
     "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN of a joint"),
     "all joints missing": (joints(lambda it: np.full_like(it, np.nan)), "all_missing", "send no body"),
+    "zeros for a joint that is not found": (WRIST_ZERO, "zeros", "NaN, or confidence 0"),
     "hardly a joint seen": (FOUR_SEEN, "few_joints", "the tracker's own threshold"),
     "a tracker that repeats itself": (body(lambda it, _: walk(0.1)[0].bodies[0]), "frozen", "repeats its last answer"),
     "confidences of zero": (confidence(np.zeros_like), "confidence_zero", "give 1"),
@@ -217,6 +220,11 @@ def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> No
 def test_of_unsorted_stamps_no_output_is_of_use(change: Callable[[int, int], int], level: Level) -> None:
     found = told([stamp(change)(raw, index) for index, raw in enumerate(walk())], live=False)
     assert found["stamps_out_of_order"][1] == level
+
+
+def test_where_the_confidence_is_zero_a_position_means_nothing() -> None:
+    lost = body(lambda it, _: RawBody(it.id, it.positions * WITH_ARMS[:, None], it.confidence * WITH_ARMS))
+    assert not told([lost(raw, index) for index, raw in enumerate(walk())])
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS)

@@ -259,6 +259,14 @@ class TestBadInput:
         assert len(cleaned[0].bodies) == 1
         assert pipeline.counters["body_id_repeated"] == 1
 
+    def test_a_joint_of_confidence_zero_is_missing_wherever_it_is(self) -> None:
+        missing, nowhere = stream(waving(40)), stream(waving(40))
+        for frame, (a, b) in enumerate(zip(missing, nowhere, strict=True)):
+            for joint in {J["left_wrist"], J["right_foot"], frame % 22}:
+                a.bodies[0].positions[joint] = np.nan
+                b.bodies[0].positions[joint], b.bodies[0].confidence[joint] = 0.0, 0.0
+        assert b"".join(map(encode, clean(missing)[0])) == b"".join(map(encode, clean(nowhere)[0]))
+
     def test_confidences_that_are_no_numbers(self) -> None:
         messages = stream(waving(10))
         messages[5].bodies[0].confidence[:] = [np.nan, np.inf, -np.inf, -1, 2, *[1.0] * 17]
