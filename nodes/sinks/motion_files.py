@@ -71,7 +71,13 @@ def read_motion(path: Path, body: int | None = None) -> BodyMotion:
     known = np.isfinite(positions).all(axis=(1, 2)) & np.isfinite(rotations).all(axis=(1, 2))
     if known.sum() < 2:
         raise ExportError(f"{path}: expected a body in two frames at least, got {known.sum()}; was anybody recognised?")
-    return steady(stamps[known], positions[known], rotations[known])
+    stamps = stamps[known]
+    if (back := np.flatnonzero(np.diff(stamps) <= 0)).size:
+        raise ExportError(
+            f"{path}: expected increasing stamps, got {stamps[back[0] + 1]:.9f} s after {stamps[back[0]]:.9f} s; sort "
+            "the input by stamp, without repeated ones, and clean it again"
+        )
+    return steady(stamps, positions[known], rotations[known])
 
 
 def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion:
@@ -82,12 +88,27 @@ def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion
         positions: (T, 22, 3) metres, world.
         rotations: (T, 22, 4) xyzw, local.
     """
-    fps = float(np.round(1.0 / np.median(np.diff(stamps_s)), 3))
+    fps = _rate(stamps_s)
     at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * fps + 0.01) + 1) / fps
     at = at.clip(max=stamps_s[-1])
     turned = np.stack([Slerp(stamps_s, Rotation.from_quat(rotations[:, j]))(at).as_quat() for j in range(22)], axis=1)
     root = np.stack([np.interp(at, stamps_s, positions[:, 0, axis]) for axis in range(3)], axis=1)
     return BodyMotion(fps, root, turned, _bones(positions, rotations), float(stamps_s[0]))
+
+
+COMMON_HZ = (10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 144.0, 150.0,
+             180.0, 200.0, 240.0, 250.0, 300.0)  # fmt: skip
+"""Frame rates of cameras and motion capture, Hz."""
+SAME = 0.01
+"""Largest deviation from a common rate that counts as rounding or jitter, ratio."""
+
+
+def _rate(stamps_s: Floats) -> float:
+    """The frame rate of stamps (T,) in seconds, Hz: of the mean step without gaps, because stamps may be rounded."""
+    steps = np.diff(stamps_s)
+    rate = 1.0 / float(steps[steps < 1.5 * np.median(steps)].mean())
+    nearest = min(COMMON_HZ, key=lambda common: abs(common - rate))
+    return nearest if abs(nearest - rate) <= SAME * nearest else float(np.round(rate, 3))
 
 
 def _bones(positions: Floats, rotations: Floats) -> Floats:

@@ -19,7 +19,16 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.sinks.glb import to_glb
-from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, ExportError, read_motion, to_bvh, to_csv, to_trc
+from steadypose.nodes.sinks.motion_files import (
+    Y_UP,
+    BodyMotion,
+    ExportError,
+    read_motion,
+    steady,
+    to_bvh,
+    to_csv,
+    to_trc,
+)
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
@@ -178,6 +187,35 @@ def test_a_gap_is_filled_and_the_rate_kept(tmp_path: Path, motion: BodyMotion) -
     assert len(found.root) == FRAMES
     np.testing.assert_allclose(found.positions, motion.positions, atol=0.05)
     np.testing.assert_allclose(found.positions[14:], motion.positions[14:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "fps"),
+    [
+        ((np.arange(FRAMES) / 30).round(3), 30.0),
+        ((np.arange(FRAMES) / 120).round(3), 120.0),
+        (np.arange(FRAMES) / 29.914, 30.0),
+        (np.arange(FRAMES) / 30 + np.random.default_rng(0).uniform(0, 0.005, FRAMES), 30.0),
+        (np.arange(FRAMES) / 30 + (np.arange(FRAMES) > 9), 30.0),
+        (np.arange(FRAMES) / 27.5, 27.5),
+    ],
+)
+def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: Floats, fps: float) -> None:
+    found = steady(stamps, motion.positions, motion.rotations)
+    assert found.fps == fps
+    assert len(found.root) == pytest.approx((stamps[-1] - stamps[0]) * found.fps + 1, abs=1)
+
+
+def test_stamps_that_decrease_are_refused_with_what_to_do(tmp_path: Path, motion: BodyMotion, capsys) -> None:
+    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **arrays | {"stamp_ns": arrays["stamp_ns"][::-1]})
+    assert main(["export", str(path), str(tmp_path / "x.bvh")]) == 2
+    assert (
+        "expected increasing stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".trc"])
