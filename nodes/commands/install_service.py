@@ -130,8 +130,8 @@ class Service:
             if _is_in(path, HOMES):
                 raise LaunchError(
                     f"{path} is in a home, which a service's own user cannot read: install steadypose elsewhere "
-                    "(python3 -m venv /opt/steadypose, then /opt/steadypose/bin/pip install steadypose), or give the "
-                    "user whose home it is with --user"
+                    "(python3 -m venv /opt/steadypose, then /opt/steadypose/bin/pip install PATH/TO/CHECKOUT), or "
+                    "give the user whose home it is with --user"
                 )
         if self.is_new_user and _is_in(Path(self.launch), HOMES):
             raise LaunchError(

@@ -52,7 +52,11 @@ def test_words_are_systemds() -> None:
 @pytest.mark.parametrize(
     ("changed", "settings", "said"),
     [
-        ({"command": Path("/home/a/.venv/bin/steadypose")}, {}, "in a home.*/opt/steadypose"),
+        (
+            {"command": Path("/home/a/.venv/bin/steadypose")},
+            {},
+            "in a home.*/opt/steadypose.*pip install PATH/TO/CHECKOUT",
+        ),
         ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy it"),
         ({"name": "../x"}, {}, "--name: expected small letters"),
         ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
