@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from steadypose.msgs.topics import POSE_WORLD
+from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Message, PoseClean
+from steadypose.nodes.checks.problem import Problem, error
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -14,6 +15,9 @@ from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.settings import launch_errors
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
+
+PATIENCE_NS = 2_000_000_000
+"""Longest time until the first message of a prior that this launch does not start, nanoseconds."""
 
 
 def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
@@ -40,10 +44,13 @@ class TrajectoryNode(Node):
         self._client_pipelines: dict[str, TrajectoryPipeline] = {}
         self._delay_frames = 0
         self._bodies = 0
+        self._seen = False
+        self._started_ns = self.clock.now_ns()
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseClean):
             return
+        self._seen = True
         self._delay_frames = message.delay_frames
         for world in self._pipeline_of(message.source).process(message):
             self._bodies = len(world.bodies)
@@ -59,6 +66,19 @@ class TrajectoryNode(Node):
         if len(self._client_pipelines) > clients:  # a client reconnected under another name
             del self._client_pipelines[next(iter(self._client_pipelines))]
         return pipeline
+
+    def problems(self) -> list[Problem]:
+        since_ns = self.clock.now_ns() - self._started_ns
+        # a prior of this launch reports itself that nothing comes
+        if self._seen or "prior" in self.launch.nodes or since_ns < PATIENCE_NS:
+            return []
+        return [
+            error(
+                "no_source",
+                f"no {POSE_CLEAN} since the start {since_ns / 1e9:.0f} s ago: expected a prior that publishes at "
+                f"{', '.join(self.launch.addresses('prior'))}; add 'prior' to nodes, or start it where it runs",
+            )
+        ]
 
     def status(self) -> dict[str, str]:
         counters = sum((p.counters for p in self._client_pipelines.values()), self._pipeline.counters)

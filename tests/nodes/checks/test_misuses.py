@@ -20,13 +20,14 @@ from tests.helpers.msg_strategies import of
 from tests.helpers.synthetic_poses import walker
 
 from steadypose import PACKAGE
-from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.checks.stream import Answers, StreamCheck
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
+from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
 
@@ -296,6 +297,18 @@ class TestNode:
     def test_a_tracker_that_never_came(self, node: PriorNode, clock: VirtualClock) -> None:
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "pose_input" in from_values(node.diagnostics().values)["no_source"]
+
+    def test_a_trajectory_without_a_prior(self, make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
+        alone, beside = (
+            TrajectoryNode(make_launch(nodes=nodes), clock) for nodes in ('["trajectory"]', '["prior", "trajectory"]')
+        )
+        assert not alone.problems()
+        clock.time_ns += round(2.5 * SECOND_NS)
+        assert "add 'prior' to nodes" in from_values(alone.diagnostics().values)["no_source"]
+        assert not beside.problems(), "its prior says so"
+        alone.publish = lambda *_, **__: True  # type: ignore[method-assign]
+        alone.handle(POSE_CLEAN, PoseClean(START_NS, "camera", "mine", Pose.identity(), False, 4, []))
+        assert not alone.problems()
 
 
 def test_the_page_has_every_cause() -> None:
