@@ -70,7 +70,9 @@ def draw(history: History, body: int | None = None) -> Figure:
     heights = [panel.height + TITLE for panel in panels]
     body_height = max(sum(heights), 9.0)
     figure = Figure(figsize=(16, STRIP + body_height), layout="constrained")
-    figure.suptitle(f"{history.name} · {history.origin} · body {chosen} of {len(bodies)}", fontsize=14, weight="bold")
+    figure.suptitle(
+        f"{history.name} · {history.origin} · body {chosen}, one of {len(bodies)}", fontsize=14, weight="bold"
+    )
     rows = figure.add_gridspec(2, 1, height_ratios=[STRIP, body_height])
     draw_stick_figures(figure.add_subplot(rows[0]), history, chosen)
     columns = rows[1].subgridspec(1, 2, width_ratios=[2.2, 1])

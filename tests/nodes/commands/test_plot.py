@@ -16,6 +16,7 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.plot import plot
 from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path
 from steadypose.nodes.sinks.plot.panels import busiest_joints, draw_contacts
 from steadypose.prior.body.skeleton import J
@@ -163,6 +164,11 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str,
     recording = record(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
     with pytest.raises(PlotError, match=expected):
         plot(recording, tmp_path / output, **options)
+
+
+def test_the_title_tells_an_id_from_a_count(tmp_path: Path) -> None:
+    history = history_of_path(record(tmp_path / "bag", 0.5, bodies=2))
+    assert draw(history, 1).get_suptitle().endswith("body 1, one of 2")
 
 
 def test_what_is_not_one_recording_says_what_to_draw(tmp_path: Path) -> None:
