@@ -36,6 +36,9 @@ CHECKED, CHECKED_NS = 45, 1_500_000_000
 NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are the units metres?"
 """Problem text of an input without any recognised body."""
 
+ENOUGH = 8
+"""Number of joints of a body that are certainly enough for a pose."""
+
 LYING = ("up_axis", "not_upright")
 """Causes of problems that somebody who lies or leans for a while also has."""
 
@@ -102,6 +105,19 @@ class Diagnosis:
         self._first_ns = None
         return new
 
+    def answer(self, asked: int, given: int) -> list[str]:
+        """Add whether most frames gave no pose, of which no problem is the reason. Returns as `look`.
+
+        Args:
+            asked: number of frames at 30 Hz in which the input has a body.
+            given: number of those in which the output has one.
+        """
+        if not self.trusted or not 0 < given < asked / 2:
+            return []
+        self._useless = True
+        text = f"{given} of {asked} frames with a body gave a pose: expected nearly all; what is not used is counted"
+        return self._note([Problem(Level.ERROR, "few_poses", text)])
+
     def _note(self, found: Iterable[Problem]) -> list[str]:
         new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}
         self.problems |= new
@@ -146,6 +162,8 @@ class OfflineRun:
         self._stamps_ns: list[int] = []
         self.diagnosis = Diagnosis(PriorSettings.from_dict(settings["prior"]))
         self.poses = 0
+        self._asked: set[int] = set()
+        self._given = 0
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         sensor, calibrated = NOWHERE, False
@@ -153,15 +171,19 @@ class OfflineRun:
             if isinstance(message, PoseRaw) and not message.end_of_stream:
                 self._stamps_ns.append(message.stamp_ns)
                 self.diagnosis.see(message)
+                if any(np.isfinite(body.positions).all(axis=1).sum() >= ENOUGH for body in message.bodies):
+                    self._asked.add(int(message.stamp_ns // FRAME_NS))
                 if self.diagnosis.frames % CHECKED == 0:
                     self.diagnosis.look()
             elif isinstance(message, PoseClean):
                 self.poses += len(message.bodies)
+                self._given += bool(message.bodies)
                 sensor, calibrated = message.sensor_pose.position, message.calibrated
             elif self._timeline and topic == POSE_WORLD and isinstance(message, PoseWorld):
                 self._timeline.add(message, sensor, calibrated=calibrated)
             yield topic, message
         self.diagnosis.end()
+        self.diagnosis.answer(len(self._asked), self._given)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:

@@ -356,6 +356,15 @@ def test_who_lies_for_a_while_is_no_reason_to_distrust_a_recording(joints: np.nd
     assert not run(lying, lying, lying, joints).diagnosis.trusted
 
 
+def test_a_recording_most_of_whose_frames_give_no_pose_is_not_trusted(joints: np.ndarray) -> None:
+    """Each frame is minutes from the next: all but the first and the last are taken for wrong stamps."""
+    stamps = np.arange(FRAMES) * 300_500_000_000
+    run = OfflineRun(source_of(joints, stamp_ns=stamps), sections(None, 4))
+    run.arrays()
+    assert not run.diagnosis.trusted
+    assert run.diagnosis.problems["few_poses"].startswith(f"2 of {FRAMES} frames with a body gave a pose")
+
+
 def test_a_misspelt_array_is_named(tmp_path: Path, joints: np.ndarray, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "in.npz", joints=joints, fps=30)
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 2
