@@ -160,7 +160,9 @@ class OfflineRun:
         self._source, self._timeline = source, timeline
         self._prior, self._trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
         self._stamps_ns: list[int] = []
-        self.diagnosis = Diagnosis(PriorSettings.from_dict(settings["prior"]))
+        prior = PriorSettings.from_dict(settings["prior"])
+        self.diagnosis = Diagnosis(prior)
+        self._identifies = prior.identify.enabled
         self.poses = 0
         self._asked: set[int] = set()
         self._given = 0
@@ -191,6 +193,11 @@ class OfflineRun:
         return np.array(self._stamps_ns, np.int64)
 
     @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids along the input's axis of bodies; none if it has no such axis, or if the prior assigns ids itself."""
+        return self._source.bodies if isinstance(self._source, ArraySource) and not self._identifies else ()
+
+    @property
     def refused(self) -> Counter[str]:
         """Number of refused or dropped frames, bodies and joints, by cause."""
         counted = self._source.refused + self._prior.counters + self._trajectory.counters
@@ -202,7 +209,7 @@ class OfflineRun:
         Raises:
             LaunchError: no frame could be read.
         """
-        collector = NpzCollector(self)
+        collector = NpzCollector(self, self.bodies)
         if not self._stamps_ns:
             raise LaunchError(f"expected frames, but none of {len(self._source)} could be read")
         return collector.arrays(self.stamps_ns)

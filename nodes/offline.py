@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Message, PoseRaw
+from steadypose.nodes.checks.geometry import check_geometry
 from steadypose.nodes.driving import stream
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
-from steadypose.nodes.sources.npz import NpzError
+from steadypose.nodes.sources.npz import ArraySource, NpzError
 from steadypose.nodes.sources.recording import with_end
 from steadypose.nodes.sources.source import RecordedSource
 from steadypose.prior.arrays import Floats
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     from steadypose.prior.fit.windows import FittedTrack
 
 
+CHECKED = 100
+"""About how many frames of a recording are checked for faults before it is completed."""
+
+
 class CompletedSource(NamedTuple):
     """The output of `complete_source`."""
 
@@ -42,6 +47,10 @@ class CompletedSource(NamedTuple):
     completion: Completion
     refused: dict[str, int]
     """number of refused or dropped messages, by cause"""
+    problems: list[str]
+    """probable faults of the joints, as text"""
+    bodies: tuple[int, ...]
+    """ids along the source's axis of bodies, if it has one"""
 
     def messages(self) -> list[tuple[str, Message]]:
         """All messages, ordered by stamp."""
@@ -51,7 +60,7 @@ class CompletedSource(NamedTuple):
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, one row for each frame of the grid that has a body."""
         stamps_ns = np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64)
-        return NpzCollector(self.answers).arrays(stamps_ns)
+        return NpzCollector(self.answers, self.bodies).arrays(stamps_ns)
 
 
 def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
@@ -86,7 +95,11 @@ def complete_source(
         answers.append((POSE_CLEAN, message))
         answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
     refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
-    return CompletedSource(raws, answers, completion, refused)
+    bodies = frames.bodies if isinstance(frames, ArraySource) else ()
+    # of key frames, only the joints are checked, and a pelvis at the origin is what `complete` is for
+    few = raws[: -1 : max(len(raws) // CHECKED, 1)]
+    problems = [f"{p.cause}: {p.text}" for p in check_geometry(few) if p.cause != "root_relative"]
+    return CompletedSource(raws, answers, completion, refused, problems, bodies)
 
 
 class Fitted(NamedTuple):

@@ -16,6 +16,7 @@ from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
+_LAYOUT_OF = {"mediapipe": "blazepose33", "azure": "azure_kinect32", "k4a": "azure_kinect32", "body38": "zed38"}
 ENOUGH = 5
 """Smallest number of messages to judge by."""
 
@@ -50,11 +51,10 @@ def _unknown(messages: Sequence[PoseRaw]) -> Problem:
     name = messages[-1].skeleton
     like = _best(messages)
     hint = f"; its {like[1]} joints are most like {like[0]!r}" if like else ""
-    close = nearest(name.lower().replace("_", "").replace("-", ""), SKELETONS)
     return error(
         "unknown_skeleton",
-        f"skeleton {name!r}{close}{hint}: expected one of {', '.join(SKELETONS)}; for a layout of your own, see "
-        "docs/sources.md",
+        f"skeleton {name!r}{_named_like(name)}{hint}: expected one of {', '.join(SKELETONS)}; for a layout of your "
+        "own, see docs/sources.md",
     )
 
 
@@ -175,12 +175,16 @@ def count_hint(shape: Sequence[int]) -> str:
 
 def skeleton_hint(name: str, shape: Sequence[int]) -> str:
     """A hint for an unknown skeleton name."""
-    plain = name.lower().replace("_", "").replace("-", "").replace(" ", "")
     return (
-        nearest(plain, SKELETONS)
+        _named_like(name)
         or count_hint(shape)
         or "; for joints of your own, give their layout (docs/library.md, docs/sources.md)"
     )
+
+
+def _named_like(name: str) -> str:
+    plain = name.lower().replace("_", "").replace("-", "").replace(" ", "")
+    return nearest(_LAYOUT_OF.get(plain, plain), SKELETONS)
 
 
 def axes_hint(shape: Sequence[int], skeleton: str) -> str:

@@ -115,6 +115,8 @@ def complete(
         terminal.print(f"  wrote an alternative: {other}")
     for cause, count in completed.refused.items():
         terminal.print(f"  not used as given, {cause}: {count}")
+    for problem in completed.problems:
+        terminal.print(f"  {problem}", style="yellow")
     if picture is not None:
         save(draw_completion(completion, source.name), picture)
         terminal.print(f"wrote {picture}")

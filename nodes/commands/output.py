@@ -226,7 +226,7 @@ def clean_recording(
         if not len(run.stamps_ns):
             raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
 
-    write_output(out, lambda: NpzCollector(messages()).arrays(run.stamps_ns), messages)
+    write_output(out, lambda: NpzCollector(messages(), run.bodies).arrays(run.stamps_ns), messages)
     if events and timeline:
         with unfinished(events) as part:
             write_events(part, timeline.events())

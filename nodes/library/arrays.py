@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-Positions = ArrayLike | Mapping[str, NDArray[Any]] | str | os.PathLike[str]
+Positions = ArrayLike | Mapping[str, ArrayLike] | str | os.PathLike[str]
 """An array; the arrays of an ``.npz`` or of an earlier call; or the path of a recording, ``.npz`` or ``.csv``."""
 SkeletonLike = str | Sequence[str] | Mapping[str, Any]
 """The name of a known layout; or a custom layout: its joints' names, or ``joints`` and ``canonical`` as in TOML."""
@@ -120,6 +120,8 @@ def skeleton_name(skeleton: SkeletonLike) -> str:
     """
     if isinstance(skeleton, str):
         return skeleton
+    if not isinstance(skeleton, Iterable):
+        raise NpzError(f"skeleton: expected the name of a layout, or its joints, got {skeleton!r}")
     described = dict(skeleton) if isinstance(skeleton, Mapping) else {"joints": skeleton}
     described["joints"] = [str(joint) for joint in described.get("joints", ())]
     name = "own_" + hashlib.sha256(json.dumps(described, sort_keys=True, default=list).encode()).hexdigest()[:12]
@@ -158,7 +160,8 @@ def source_of(
     if isinstance(positions, Mapping):
         if "positions" not in positions:
             raise NpzError(f"expected an array 'positions' among those given, got {', '.join(positions) or 'none'}")
-        return ArraySource(ARRAYS, {**as_input(positions), **stated})
+        named = {name: as_array(name, value) for name, value in positions.items()}
+        return ArraySource(ARRAYS, {**as_input(named), **stated})
     stated = {"skeleton": np.array(CANONICAL.name), "up": np.array("z")} | stated
     return ArraySource(ARRAYS, {"positions": as_array("positions", positions)} | stated)
 
@@ -263,16 +266,20 @@ def complete(
             the expected motion by about ``sigma``.
 
     Returns:
-        The arrays of `clean`, with a row every 1/30 s from the first stamp to the last.
+        The arrays of `clean`, with a row every 1/30 s from the first observation to the last.
 
     Raises:
         ValueError: as in `clean`, or if there is no body.
+
+    Warns:
+        InputWarning: as in `clean`.
     """
     from steadypose.nodes.offline import complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     completed = complete_source(source, "positions", *load_completer(weights), seed=seed)
-    return Poses(completed.arrays(), refused=completed.refused)
+    warn(completed.problems)
+    return Poses(completed.arrays(), completed.problems, completed.refused)
 
 
 @suggesting
@@ -319,7 +326,12 @@ def fit(
 
 
 @suggesting
-def plot(poses: Positions, output: str | Path | None = None, *, body: int | None = None) -> Figure:
+def plot(
+    poses: Mapping[str, NDArray[Any]] | str | os.PathLike[str],
+    output: str | Path | None = None,
+    *,
+    body: int | None = None,
+) -> Figure:
     """Plot poses, as `steadypose plot` does.
 
     Args:

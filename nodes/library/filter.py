@@ -81,8 +81,7 @@ class Filter:
         if self._skeleton not in SKELETONS:
             hint = skeleton_hint(self._skeleton, ())
             raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
-        if not isinstance(sensor_pose, Pose | None):
-            raise FilterError(f"sensor_pose: expected steadypose.Pose(position, orientation), got {sensor_pose!r}")
+        _check_pose(sensor_pose)
         self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
         given = sections(settings, delay)
         event_settings = build_settings(EventSettings, given["events"], "events")
@@ -143,6 +142,7 @@ class Filter:
         sensor_pose: Pose | None = None,
     ) -> list[Poses]:
         """Take a frame, and return all poses that it completes, oldest first: several if the camera is below 30 Hz."""
+        _check_pose(sensor_pose)
         stamp = _stamp(t, stamp_ns)
         bodies, self._several = self._bodies(joints, confidence, ids)
         if sensor_pose is not None:
@@ -242,6 +242,11 @@ class Filter:
             raise FilterError(f"ids: expected {len(positions)} different integers, one a body, got {list(ids or ())}")
         bodies = [RawBody(int(id), *parts) for id, *parts in zip(numbers, positions, sure, strict=True)]
         return [body for body in bodies if not (several and np.isnan(body.positions).all())], several
+
+
+def _check_pose(pose: object) -> None:
+    if not isinstance(pose, Pose | None):
+        raise FilterError(f"sensor_pose: expected steadypose.Pose(position, orientation), got {pose!r}")
 
 
 def _stamp(t: float | None, stamp_ns: int | None) -> int:

@@ -45,10 +45,16 @@ _NEAREST = ("state", "anomaly_flag")
 
 
 class NpzCollector:
-    """Collects the output of both pipelines on the 30 Hz grid, and interpolates it at the stamps of the input."""
+    """Collects the output of both pipelines on the 30 Hz grid, and interpolates it at the stamps of the input.
 
-    def __init__(self, messages: Iterable[tuple[str, Message]] = ()) -> None:
-        self._rows: dict[int, list[NDArray[np.void]]] = {}
+    Args:
+        messages: the output.
+        bodies: ids of the input's axis of bodies, if it has one. The arrays then have the same axis.
+    """
+
+    def __init__(self, messages: Iterable[tuple[str, Message]] = (), bodies: Iterable[int] = ()) -> None:
+        self._rows: dict[int, list[NDArray[np.void]]] = {body_id: [] for body_id in bodies}
+        self._axis = bool(self._rows)
         self.newest: dict[int, NDArray[np.void]] = {}
         """the row of each body in the last ``pose/clean``, by its id"""
         for _, message in messages:
@@ -74,9 +80,10 @@ class NpzCollector:
 
     def arrays(self, stamps_ns: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         """The output's arrays at ``stamps_ns`` (T,), by name."""
-        tracks = [_at(np.stack(rows), stamps_ns) for rows in self._rows.values()]
+        blank = _blank(stamps_ns.shape)
+        tracks = [_at(np.stack(rows), stamps_ns) if rows else blank for rows in self._rows.values()]
         table = np.stack(tracks, axis=1) if tracks else _blank((len(stamps_ns), 1))
-        several = len(tracks) > 1
+        several = self._axis or len(tracks) > 1
         arrays: dict[str, NDArray[Any]] = {
             name: table[name] if several else table[name][:, 0] for name in _ROW.names or () if name != "stamp_ns"
         }

@@ -157,6 +157,8 @@ class ArraySource:
         self._positions = positions.reshape(frames, -1, joints, 3)
         self._confidence = confidence.reshape(frames, -1, joints)
         self._ids = _ids(path, arrays, self._positions.shape[1])
+        self.bodies = tuple(self._ids) if positions.ndim == 4 else ()
+        """ids along the axis of bodies; none if the positions have no such axis"""
         try:
             self._sensor_pose = Pose.from_up(_text(path, arrays, "up") if "up" in arrays else "z")
         except ValueError as error:

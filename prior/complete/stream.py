@@ -113,7 +113,7 @@ def complete_raws(
 
     Args:
         source: name of the recording in error messages.
-        raws: its messages, at least one.
+        raws: its messages, at least one, in any order.
         fill: a completer.
         uncertainty: standard deviations of its output.
         began: called with the number of frames of all bodies together.
@@ -123,7 +123,8 @@ def complete_raws(
     Raises:
         CompletionError: the recording has an unknown skeleton, no body, or no body in metres.
     """
-    anchor_ns = min(message.stamp_ns for message in raws)
+    raws = sorted(raws, key=lambda message: message.stamp_ns)
+    anchor_ns = raws[0].stamp_ns
     stretches = _stretches(source, raws, anchor_ns)
     began(sum(len(stretch.given) for stretch in stretches))
     done: list[tuple[Stretch, Completed]] = []

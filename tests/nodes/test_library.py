@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,36 @@ def test_several_bodies() -> None:
     np.testing.assert_array_equal(given["positions"][:, 0], steadypose.clean(joints[:, 0], fps=30.0)["positions"])
     assert np.isnan(given["positions"][:28, 1]).all()
     assert np.abs(given["positions"][-1, 1, :, 0] - joints[-1, 1, :, 0]).max() < 0.1
+
+
+def test_an_axis_of_bodies_stays_whoever_is_there() -> None:
+    nobody = np.full_like(WALK, np.nan)
+    joints = np.stack([nobody, WALK, nobody], axis=1)
+    given = steadypose.clean(joints, fps=30.0)
+    assert given["body_id"].tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(given["positions"][:, 1], steadypose.clean(WALK, fps=30.0)["positions"])
+    assert np.isnan(given["positions"][:, [0, 2]]).all()
+    assert (given["state"][:, [0, 2]] == steadypose.JointState.UNKNOWN).all()
+    assert steadypose.clean(WALK[:, None], fps=30.0)["positions"].shape == (FRAMES, 1, 22, 3)
+    assert steadypose.complete(joints, fps=30.0)["positions"].shape == (FRAMES, 3, 22, 3)
+
+
+def test_frames_to_complete_may_come_in_any_order_and_lying_bodies_are_warned_of() -> None:
+    stamps = np.arange(FRAMES) * 33_333_333
+    seen = WALK.copy()
+    seen[20:30, 20] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = steadypose.complete(seen, stamp_ns=stamps)
+    turned = steadypose.complete(seen[::-1], stamp_ns=stamps[::-1])
+    np.testing.assert_array_equal(turned["positions"], done["positions"])
+    with pytest.warns(steadypose.InputWarning, match="up_axis"):
+        assert steadypose.complete(seen[..., [1, 2, 0]], stamp_ns=stamps).problems
+
+
+def test_arrays_by_name_may_be_lists_and_numbers() -> None:
+    given = steadypose.clean({"positions": WALK.tolist(), "fps": 30.0, "skeleton": "smpl22", "up": "z"})
+    np.testing.assert_array_equal(given["positions"], steadypose.clean(WALK, fps=30.0)["positions"])
 
 
 def test_what_is_missing_is_named() -> None:

@@ -73,6 +73,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j[:, :17], fps=30, skeleton="COCO_17"),
         "did you mean 'coco17'",
     ),
+    "a skeleton by its tracker's name": (lambda j: steadypose.Filter("MediaPipe"), "did you mean 'blazepose33'"),
+    "no skeleton": (lambda j: steadypose.Filter(None), "name of a layout, or its joints, got None"),  # type: ignore[arg-type]
     "a skeleton that nobody knows": (lambda j: steadypose.Filter(skeleton="thing"), "expected one of smpl22, coco17"),
     "no rate": (lambda j: steadypose.clean(j), "of a regular stream give fps, 30 for instance"),
     "stamps in seconds": (
