@@ -1,9 +1,10 @@
 """The messages as Python dataclasses.
 
-Units are SI; stamps are capture times in nanoseconds; quaternions are xyzw; the world is right-handed with z up and the
-floor at z = 0. A constructor accepts anything that numpy converts to an array, converts it to the dtype declared here,
-and raises a `ValueError` that names the field, what was expected and what came. It checks form, not plausibility: a NaN
-or a body 10 km away makes a valid message, and the receiver has to handle it.
+Units are SI; stamps are capture times in nanoseconds; quaternions are xyzw; the world is right-handed with z up,
+and the floor is at z = 0 if the sensor's pose is calibrated. A constructor accepts anything that numpy converts to an
+array, converts it to the dtype declared here, and raises a `ValueError` that names the field, what was expected and
+what came. It checks form, not plausibility: a NaN or a body 10 km away makes a valid message, and the receiver has to
+handle it.
 
 Messages compare by value, with NaN equal to NaN. A field's annotation defines its form for the constructor and the
 codec. The codec takes the wire format from the definitions in `msgs/msg`.

@@ -31,8 +31,8 @@ def export(
 ) -> int:
     """Write cleaned motion for other programs. The ending of OUT chooses the format.
 
-    The file holds one body, in the world frame (floor at 0), at the input's frame rate. Bone lengths are constant, the
-    rotations are those of 'clean', and the rest pose is a T-pose.
+    The file holds one body, in the world frame (floor at 0 if the sensor's pose is calibrated), at the input's frame
+    rate. Bone lengths are constant, the rotations are those of 'clean', and the rest pose is a T-pose.
       .bvh   animation programs: centimetres, y up, facing +z
       .glb   Blender, Unity, Unreal, browsers: bones with a skin; metres, y up
       .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop
