@@ -6,14 +6,15 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import finite_joints
+from steadypose.prior.body.skeleton import finite_joints, limbs
 from steadypose.prior.complete.windows import frames_since_and_until
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
 
-WHOLE, PART = (0.5, 60.0), (0.8, 40.0)
+WHOLE, PART, LOWER_ARM = (0.5, 60.0), (0.8, 40.0), (0.8, 20.0)
 """Share of each joint's own cubic spline in short gaps, and length of gaps without it, frames: where no joint is known,
-and where others are. The completer's errors accumulate along limbs, and those of noisy joints count many times."""
+where others are, and for an elbow and a wrist if the shoulder is. The completer's errors accumulate along limbs, and
+those of noisy joints count many times; but a spline overshoots where a wrist turns back."""
 
 LAG, RUN = 8, 6
 """Number of later frames from which a known joint is smoothed, and of known frames in a row below which it is not: of
@@ -39,7 +40,10 @@ def splines(smooth: Floats, known: Bools) -> tuple[Floats, Floats]:
     """Return the share (T, 22) of each joint's own cubic spline in its position, and the spline (T, 22, 3), metres."""
     since, until = frames_since_and_until(known)
     gap = np.where(known, np.inf, since + until - 1.0)
-    most, longest = np.where(np.asarray(known.any(axis=1))[:, None, None], PART, WHOLE).transpose(2, 0, 1)
+    curve = np.where(np.asarray(known.any(axis=1))[:, None, None], PART, np.broadcast_to(WHOLE, (*known.shape, 2)))
+    for shoulder, *below in limbs(("shoulder", "elbow", "wrist")):
+        curve[:, below] = np.where(known[:, shoulder, None, None], LOWER_ARM, curve[:, below])
+    most, longest = curve.transpose(2, 0, 1)
     share = most * np.maximum(1.0 - gap / longest, 0.0)
     line, times = np.zeros(smooth.shape), np.arange(len(smooth))
     for joint in np.flatnonzero((share > 0).any(axis=0)):

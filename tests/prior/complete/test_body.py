@@ -80,7 +80,7 @@ def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of
     ],
 )
 def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
-    for share in ("WHOLE", "PART"):  # splines do not know it
+    for share in ("WHOLE", "PART", "LOWER_ARM"):  # splines do not know it
         monkeypatch.setattr(splines, share, (0.0, 1.0))
     positions = waving(300)
     seen = positions.copy()
@@ -215,6 +215,15 @@ def test_short_gaps_are_nearer_to_each_joints_spline_than_long_ones() -> None:
         done = complete(Raised(positions), seen, REST_OFFSETS)
         off.append((done.positions - positions)[100 + gap // 2, 0, 2])
     np.testing.assert_allclose(off, (0.055, 0.075, 0.1), atol=0.006)
+
+
+def test_a_lower_arm_follows_its_spline_less_where_its_shoulder_is_known() -> None:
+    known = np.ones((60, 22), dtype=bool)
+    known[20:30, [J["left_wrist"], J["right_shoulder"], J["right_wrist"], J["left_foot"]]] = False
+    share, _ = splines.splines(waving(60), known)
+    parts = "left_wrist", "right_shoulder", "right_wrist", "left_foot"
+    np.testing.assert_allclose(share[25, [J[part] for part in parts]], (0.4, 0.6, 0.6, 0.6))
+    assert not share[25, known[25]].any()
 
 
 def test_errors_that_last_do_not_throw_an_arm_off_course_in_a_short_gap() -> None:
