@@ -45,9 +45,9 @@ def clean(
     OUT/manifest.jsonl lists the result of each recording. If you run the command again, it does only what is left. A
     recording that cannot be cleaned does not stop the others.
 
-    OUT is written whatever is wrong with the poses. The exit status is 1 if it cannot be trusted (units, axes or joint
-    order are wrong, or there is nobody) or IN is damaged; of a folder, if this holds for a recording, or one cannot be
-    cleaned.
+    OUT is written whatever is wrong with the poses. The exit status is 1 if it cannot be trusted (units, axes, order of
+    joints or rows are wrong, most frames give no pose, or there is nobody) or IN is damaged; of a folder, if this holds
+    for a recording, or one cannot be cleaned.
 
     Args:
         source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
