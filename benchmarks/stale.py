@@ -15,18 +15,15 @@ STALE = {
     "hidden_joints": _SIGMA,
     "noisy_joints": _SIGMA,
     "retarget": _SIGMA,
-    "rotations": _SIGMA,
     "world": _SIGMA,
     "contacts": _POSTURE,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
     "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
     "people, in noise that lasts, went from 24.3 to 23.5 mm by the first",
-    "kinect_vicon": "joints inform each other since: of four people, 38.1 to 36.9 mm at a delay of four frames",
-    "latency": "joints inform each other since, which takes 0.2 ms a frame",
     "mediapipe": "joints inform each other since: 66.5 to 66.1 mm at a delay of four frames",
+    "interpolation": "a hidden wrist or ankle no longer turns its limb since, and both are hidden as well",
     "restart": _POSTURE,
-    "scale": "joints inform each other since, which takes 0.2 ms a frame",
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
