@@ -8,11 +8,8 @@ _VARIANT = "nothing that it measures has changed: HM-VAE's variant, which it doe
 
 STALE = {
     "ablations": _SIGMA,
-    "event_mocap": _SIGMA,
     "events": _SIGMA,
-    "noisy_joints": _SIGMA,
     "retarget": _SIGMA,
-    "world": _SIGMA,
     "contacts": _POSTURE,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
