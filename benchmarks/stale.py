@@ -10,13 +10,10 @@ STALE = {
     "ablations": _SIGMA,
     "events": _SIGMA,
     "retarget": _SIGMA,
-    "contacts": _POSTURE,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
     "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
     "people, in noise that lasts, went from 24.3 to 23.5 mm by the first",
-    "mediapipe": "joints inform each other since: 66.5 to 66.1 mm at a delay of four frames",
-    "interpolation": "a hidden wrist or ankle no longer turns its limb since, and both are hidden as well",
     "restart": _POSTURE,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }

@@ -113,7 +113,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         "or stamp_ns, got both; leave fps out",
     ),
     "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
-    "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),
+    "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),  # type: ignore[arg-type]
     "a delay of seconds": (
         lambda j: steadypose.clean(j, fps=30, delay=0.1),  # type: ignore[arg-type]
         "expected int such as 4, got 0.1",
