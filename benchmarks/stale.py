@@ -8,8 +8,6 @@ _VARIANT = "nothing that it measures has changed: HM-VAE's variant, which it doe
 
 STALE = {
     "ablations": _SIGMA,
-    "events": _SIGMA,
-    "retarget": _SIGMA,
     "hgvae": _VARIANT,
     "humor": _POSTURE,
     "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
