@@ -12,7 +12,6 @@ STALE = {
     "humor": _POSTURE,
     "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
     "people, in noise that lasts, went from 24.3 to 23.5 mm by the first",
-    "restart": _POSTURE,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
