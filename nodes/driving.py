@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.checks.problem import Problem
+from steadypose.nodes.checks.problem import Problem, observed
 from steadypose.nodes.checks.stamps import check_length
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
@@ -173,7 +173,7 @@ class OfflineRun:
             if isinstance(message, PoseRaw) and not message.end_of_stream:
                 self._stamps_ns.append(message.stamp_ns)
                 self.diagnosis.see(message)
-                if any(np.isfinite(body.positions).all(axis=1).sum() >= ENOUGH for body in message.bodies):
+                if any(np.isfinite(observed(body)[:, 0]).sum() >= ENOUGH for body in message.bodies):
                     self._asked.add(int(message.stamp_ns // FRAME_NS))
                 if self.diagnosis.frames % CHECKED == 0:
                     self.diagnosis.look()

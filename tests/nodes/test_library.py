@@ -77,6 +77,14 @@ def test_frames_to_complete_may_come_in_any_order_and_lying_bodies_are_warned_of
         assert steadypose.complete(seen[..., [1, 2, 0]], stamp_ns=stamps).problems
 
 
+def test_frames_of_confidence_zero_are_not_missed() -> None:
+    sure = np.ones(WALK.shape[:2])
+    sure[: 2 * FRAMES // 3] = 0.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isfinite(steadypose.clean(WALK, fps=30.0, confidence=sure)["positions"][-1]).all()
+
+
 def test_arrays_by_name_may_be_lists_and_numbers() -> None:
     given = steadypose.clean({"positions": WALK.tolist(), "fps": 30.0, "skeleton": "smpl22", "up": "z"})
     np.testing.assert_array_equal(given["positions"], steadypose.clean(WALK, fps=30.0)["positions"])
