@@ -174,7 +174,7 @@ class OfflineRun:
                 self._stamps_ns.append(message.stamp_ns)
                 self.diagnosis.see(message)
                 if any(np.isfinite(observed(body)[:, 0]).sum() >= ENOUGH for body in message.bodies):
-                    self._asked.add(int(message.stamp_ns // FRAME_NS))
+                    self._asked.add(round(message.stamp_ns / FRAME_NS))
                 if self.diagnosis.frames % CHECKED == 0:
                     self.diagnosis.look()
             elif isinstance(message, PoseClean):

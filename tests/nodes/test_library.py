@@ -79,7 +79,7 @@ def test_frames_to_complete_may_come_in_any_order_and_lying_bodies_are_warned_of
 
 def test_frames_of_confidence_zero_are_not_missed() -> None:
     sure = np.ones(WALK.shape[:2])
-    sure[: 2 * FRAMES // 3] = 0.0
+    sure[: 4 * FRAMES // 5] = 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isfinite(steadypose.clean(WALK, fps=30.0, confidence=sure)["positions"][-1]).all()
