@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from steadypose import PACKAGE
-from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, PoseWorld, WorldBody
+from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, PoseWorld, RawBody, WorldBody
 from steadypose.nodes.driving import stream
 from steadypose.nodes.sources.recording import open_recording
+from steadypose.prior.body.skeleton import J, limbs
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.complete.body import Uncertainty
@@ -26,22 +27,43 @@ FRAMES = 120
 """Number of frames of each bundled stream that are processed."""
 PROJECTIONS = 8
 """Number of projections kept of each output."""
+HIDDEN = 50, 70
+"""First frame in which an arm is hidden, and first in which it is seen again."""
+LEGLESS = "wave_hidden_arm"
+"""Stream whose legs are never seen."""
+NOISE_M = 0.01
+"""Standard deviation of the noise along an axis, metres."""
+
+_ARM = [J["left_elbow"], J["left_wrist"]]
+_LEGS = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
 
 
 @cache
 def outputs() -> dict[str, list[float]]:
     """Return random projections of outputs by name: with default settings, with HM-VAE's refinement, and of `complete`.
 
+    Sensors lack joints of the canonical 22, and most studies give all of them. So the same outputs are also returned
+    for the true joints of some streams, with noise and with hidden limbs.
+
     A projection has weights of 1 and -1, divided by the root of their number. It changes by about the root mean square
     change of the output, so eight numbers measure how much 100,000 differ.
     """
     paths = sorted(path.parent for path in (PACKAGE / "sim_data").glob("*/metadata.yaml"))
-    default = [part for path in paths for part in _answers(path, PriorSettings())]
+    sensed, given = [_sensed(path) for path in paths], [_given(path) for path in paths[-3:]]
+    default, of_given = (
+        [part for raws in each for part in _answers(raws, PriorSettings())] for each in (sensed, given)
+    )
     refining = PriorSettings.from_dict({"refine": {"enabled": True}})
+    refined, refined_of_given = (_answers(raws, refining) for raws in (sensed[0], given[0]))
     return {
         "pose/clean": projections(values for kind, values in default if kind is PoseClean),
         "pose/world": projections(values for kind, values in default if kind is PoseWorld),
-        "pose/clean, HM-VAE": projections(values for kind, values in _answers(paths[0], refining) if kind is PoseClean),
+        "pose/clean, HM-VAE": projections(values for kind, values in refined if kind is PoseClean),
+        "pose/clean of 22 joints": projections(values for kind, values in of_given if kind is PoseClean),
+        "pose/world of 22 joints": projections(values for kind, values in of_given if kind is PoseWorld),
+        "pose/clean of 22 joints, HM-VAE": projections(
+            values for kind, values in refined_of_given if kind is PoseClean
+        ),
         "complete": projections(_completed(path) for path in paths[:2]),
     }
 
@@ -55,10 +77,32 @@ def _completed(path: Path) -> np.ndarray:
     return np.concatenate([np.ravel(completed.positions[np.isfinite(completed.positions)]) for _, completed in done])
 
 
-def _answers(path: Path, settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
-    raw = (item for item in open_recording(path) if isinstance(item[1], PoseRaw))
+def _sensed(path: Path) -> list[PoseRaw]:
+    raws = (message for _, message in open_recording(path) if isinstance(message, PoseRaw))
+    return list(islice(raws, FRAMES))
+
+
+def _given(path: Path) -> list[PoseRaw]:
+    """Return the true joints of a stream, with noise; an arm is hidden for a while, and in one stream legs are never
+    seen."""
+    rng = np.random.default_rng(0)
+    true = (message for _, message in open_recording(path) if isinstance(message, PoseWorld) and message.bodies)
+    raws = []
+    for k, message in enumerate(islice(true, FRAMES)):
+        bodies = []
+        for body in message.bodies:
+            confidence = np.ones(22, dtype=np.float32)
+            confidence[_LEGS] = path.name != LEGLESS
+            confidence[_ARM] = not HIDDEN[0] <= k < HIDDEN[1]
+            noisy = body.positions + rng.normal(0.0, NOISE_M, (22, 3)).astype(np.float32)
+            bodies.append(RawBody(body.id, noisy, confidence))
+        raws.append(PoseRaw(message.stamp_ns, "world", path.name, "smpl22", Pose.identity(), True, bodies))
+    return raws
+
+
+def _answers(raws: Iterable[PoseRaw], settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
     pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
-    for _, message in stream(islice(raw, FRAMES), *pipelines):
+    for _, message in stream(((raw.stamp_ns, raw) for raw in raws), *pipelines):
         if isinstance(message, PoseClean | PoseWorld):
             yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
 

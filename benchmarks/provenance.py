@@ -29,14 +29,23 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).parent / "results"
 """Folder of the results from which the README's tables are written."""
 
-CLEAN = ("pose/clean", "mixture weights", "occlusion weights", "hgvae weights", "posture weights")
+_WEIGHTS = ("mixture weights", "occlusion weights", "hgvae weights", "posture weights")
+_HMVAE, _TRAJECTORY = ("hmvae weights",), ("contacts weights", "trajectory weights")
+
+CLEAN = ("pose/clean", *_WEIGHTS)
 """What `pose/clean` with default settings depends on, including the names in `ships`."""
+CLEAN_22 = ("pose/clean of 22 joints", *_WEIGHTS)
+"""The same, if all canonical joints are given."""
 
-VARIANTS = (*CLEAN, "pose/clean, HM-VAE", "hmvae weights")
+VARIANTS = (*CLEAN, "pose/clean, HM-VAE", *_HMVAE)
 """What all variants of `benchmarks.product` depend on. One of them refines with HM-VAE, which the default does not."""
+VARIANTS_22 = (*CLEAN_22, "pose/clean of 22 joints, HM-VAE", *_HMVAE)
+"""The same, if all canonical joints are given."""
 
-WORLD = (*CLEAN, "pose/world", "contacts weights", "trajectory weights")
+WORLD = (*CLEAN, "pose/world", *_TRAJECTORY)
 """What `pose/world` depends on."""
+WORLD_22 = (*CLEAN_22, "pose/world of 22 joints", *_TRAJECTORY)
+"""The same, if all canonical joints are given."""
 
 COMPLETE = "complete"
 """Output of `steadypose complete` on streams with a gap."""
@@ -130,7 +139,8 @@ def _file_of(module: str) -> Path:
 
 @cache
 def definitions(path: Path) -> list[str]:
-    """Return ``NAME DIGEST`` of every function, class and constant of a module that can change a figure."""
+    """Return ``NAME DIGEST`` of every function, class and constant of a module that can change a figure, which
+    ``DEPENDS_ON`` cannot."""
     found = []
     for node in ast.parse(path.read_bytes()).body:
         match node:
@@ -146,6 +156,8 @@ def definitions(path: Path) -> list[str]:
                 pass
             case _:
                 continue
+        if name == "DEPENDS_ON":
+            continue
         found.append(f"{name} {_digest([ast.dump(_bare(node)).encode()])[:8]}")
     return found
 

@@ -26,7 +26,7 @@ from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.provenance import VARIANTS, WORLD
+from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
@@ -52,7 +52,7 @@ from steadypose.prior.models.mixture import inference
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-DEPENDS_ON = (*VARIANTS, *WORLD)
+DEPENDS_ON = (*VARIANTS_22, *WORLD_22)
 
 AS_IT_SHIPS = "as it ships"
 DELAY = 4

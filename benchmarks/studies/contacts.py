@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.provenance import WORLD_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, REST_HEIGHT, REST_SPEED, label_contacts
@@ -25,7 +25,7 @@ from steadypose.prior.models.contacts import LiveContacts, contact_features
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = WORLD
+DEPENDS_ON = WORLD_22
 
 LOADED_N = 30.0
 """Force above which a foot bears load, newtons."""

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import spread
-from steadypose.benchmarks.provenance import WORLD
+from steadypose.benchmarks.provenance import WORLD_22
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.systems.event_scenes import Label, Scene, Score, common, lying, runs, seated
 from steadypose.benchmarks.systems.events import CAMERA, DELAYS, record_of, scored, table_of
@@ -33,7 +33,7 @@ from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = (*WORLD, "prior.events")
+DEPENDS_ON = (*WORLD_22, "prior.events")
 
 SEED, ALL, CLIPS = 7, "all", 2
 """Seed of positions and noise; name of the group of all; largest number of clips per action of a data set."""

@@ -22,14 +22,14 @@ from steadypose.benchmarks.corruption import along_sight, gaussian
 from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.product import PRODUCT
-from steadypose.benchmarks.provenance import CLEAN
+from steadypose.benchmarks.provenance import CLEAN_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import pivot, source_table
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = CLEAN
+DEPENDS_ON = CLEAN_22
 
 DELAYS = (0, 2, 4, 8, 16)
 SPEEDS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)

@@ -23,7 +23,7 @@ from steadypose.benchmarks.baselines.whole_body_kalman import whole_body_kalman
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from steadypose.benchmarks.product import PRODUCT
-from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.corrupted import (
@@ -38,7 +38,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, limbs
 from steadypose.prior.timing.rate import FPS
 
-DEPENDS_ON = VARIANTS
+DEPENDS_ON = VARIANTS_22
 
 BESIDE = "held beside the body"
 GAUSSIAN = "conditional Gaussian"

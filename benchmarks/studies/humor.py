@@ -21,7 +21,7 @@ from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.banks import bank
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_set
-from steadypose.benchmarks.provenance import CLEAN, ROOT
+from steadypose.benchmarks.provenance import CLEAN_22, ROOT
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import (
     CAMERA_HEIGHT,
@@ -171,7 +171,7 @@ def _mm(value: Tensor) -> float:
     return round(float(value) * 1e3, 1)
 
 
-DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit", "training.recipes.humor")
+DEPENDS_ON = (*CLEAN_22, "humor weights", "prior.fit", "training.recipes.humor")
 
 FRAMES = 90
 DELAY = 8

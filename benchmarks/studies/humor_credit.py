@@ -18,7 +18,7 @@ from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.provenance import CLEAN
+from steadypose.benchmarks.provenance import CLEAN_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import (
     CAMERA_HEIGHT,
@@ -41,7 +41,7 @@ from steadypose.prior.fit.energy import Standing, Transitions
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.solve import FitSettings, Start
 
-DEPENDS_ON = (*CLEAN, "humor weights", "prior.fit")
+DEPENDS_ON = (*CLEAN_22, "humor weights", "prior.fit")
 
 SMOOTH = (2.0, 4.0, 8.0, 16.0, 32.0)
 """Smoothness of stage 2, m/s²."""

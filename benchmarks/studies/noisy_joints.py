@@ -16,7 +16,7 @@ from steadypose.benchmarks.baselines import flk
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
-from steadypose.benchmarks.provenance import VARIANTS
+from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
 from steadypose.benchmarks.studies.corrupted import (
@@ -29,7 +29,7 @@ from steadypose.benchmarks.studies.corrupted import (
 )
 from steadypose.prior.arrays import Floats
 
-DEPENDS_ON = VARIANTS
+DEPENDS_ON = VARIANTS_22
 
 LEVELS_CM = (1, 2, 4, 8)
 

@@ -22,7 +22,7 @@ from steadypose.benchmarks.bench import Bench, baselines_of, tune, tuning_log
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.metrics import contact_speed, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.provenance import VARIANTS, WORLD
+from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import ends_mm, figures, score, source_table
 from steadypose.benchmarks.studies.root_drift import METHODS, Clip, evaluate_fusion
@@ -35,7 +35,7 @@ from steadypose.prior.world.observe import FEET, SOLE
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-DEPENDS_ON = (*VARIANTS, *WORLD)
+DEPENDS_ON = (*VARIANTS_22, *WORLD_22)
 
 NOISE = 0.02
 """Standard deviation of the noise, metres, with a correlation of 0.9 between frames."""
