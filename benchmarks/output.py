@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from steadypose import PACKAGE
+from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import CleanBody, Pose, PoseClean, PoseRaw, PoseWorld, RawBody, WorldBody
 from steadypose.nodes.driving import stream
 from steadypose.nodes.sources.recording import open_recording
@@ -102,7 +103,7 @@ def _given(path: Path) -> list[PoseRaw]:
 
 def _answers(raws: Iterable[PoseRaw], settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
     pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
-    for _, message in stream(((raw.stamp_ns, raw) for raw in raws), *pipelines):
+    for _, message in stream(((POSE_RAW, raw) for raw in raws), *pipelines):
         if isinstance(message, PoseClean | PoseWorld):
             yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
 
