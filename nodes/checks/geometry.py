@@ -169,8 +169,10 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
 
 
 def _zeros(skeleton: Skeleton, joints: Floats) -> Problem | None:
-    """The problem of joints (N, J, 3) that are zero where the sensor has none. A pelvis may be the origin."""
-    zero = (joints == 0.0).all(axis=-1) & ~(skeleton.to_canonical[J["pelvis"]] == 1.0)
+    """The problem of joints (N, J, 3) that are zero where the sensor has none. A pelvis may be the origin, as may the
+    midpoint of the hips, which no canonical joint needs."""
+    weights = skeleton.to_canonical
+    zero = (joints == 0.0).all(axis=-1) & weights.any(axis=0) & (weights[J["pelvis"]] != 1.0)
     if not zero.any():
         return None
     worst = int(zero.sum(axis=0).argmax())

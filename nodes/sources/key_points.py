@@ -96,7 +96,7 @@ def read_key_points(path: Path) -> KeyPointRecording:
     weights = layout.to_canonical
     pixels = np.einsum("cj,tjx->tcx", weights, np.nan_to_num(keypoints))
     found = np.isfinite(keypoints).all(axis=-1)
-    needed = weights > 0
+    needed = weights != 0
     sure = np.where(needed, np.where(found, confidence, 0.0)[:, None], np.inf).min(axis=-1)
     sure = np.where(needed.any(axis=1), sure, 0.0)
     pixels[sure <= 0] = np.nan

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import MIDDLES, NEEDED, Skeleton
+from steadypose.prior.body.layouts import NEEDED, Skeleton, middles
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
 Mixture = Mapping[str, float]
@@ -41,13 +41,10 @@ _PARTS = {
     "toe": "foot", "toes": "foot", "clavicle": "collar", "sjc": "shoulder", "ejc": "elbow", "wjc": "wrist",
 }  # fmt: skip
 """Synonyms of body parts in the names of points."""
-_MIDDLE_PARTS = {
-    "pelvis": "pelvis", "hip": "pelvis", "hips": "pelvis", "midhip": "pelvis", "spine1": "spine1", "spine2": "spine2",
-    "spine3": "spine3", "neck": "neck", "midshoulder": "neck", "head": "head",
-}  # fmt: skip
 _WORDS = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _SIDE_OF = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _MIDDLE = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
+_MIDDLE_PARTS = {joint: joint for joint in _MIDDLE} | {"hips": "pelvis"}
 _ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean()
 """(22,) height of each joint above the hips in the rest pose, metres."""
 
@@ -231,7 +228,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
     """Recognise the skeleton of named points in TRC and C3D files by their names, as points have no tree.
 
     A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are the same joint. Pelvis,
-    neck and head may be midpoints of hips, shoulders and ears. A joint without points stays unobserved.
+    neck and head may lie between hips, shoulders and ears. A joint without points stays unobserved.
 
     Raises:
         RigError: hips or shoulders are missing.
@@ -246,11 +243,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
             sided.setdefault(f"{sides.pop()}_{_PARTS.get(part, part)}", name)
         elif part in _MIDDLE_PARTS:
             table.setdefault(_MIDDLE_PARTS[part], name)
-    for middle, part in MIDDLES.items():
-        ends = [sided[f"{side}_{part}"] for side in ("left", "right") if f"{side}_{part}" in sided]
-        if middle not in table and len(ends) == 2:
-            table[middle] = dict.fromkeys(ends, 1.0)
-    table |= {joint: name for joint, name in sided.items() if joint in JOINTS}
+    table = middles(sided) | table | {joint: name for joint, name in sided.items() if joint in JOINTS}
     if missing := [joint for joint in NEEDED if joint not in table]:
         raise RigError(
             f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with {BY_RIG} which"

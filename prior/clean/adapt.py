@@ -21,8 +21,9 @@ MAX_DISTANCE = 30.0
 """Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
 MAX_PLACE = 10_000.0
 """Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
-MAX_SIZE, MIN_BONES = 2.5, 4
-"""Largest median ratio of a body's bone lengths to the mean person's; least number of observed bones to judge it."""
+MIN_SIZE, MAX_SIZE, MIN_BONES = 0.05, 2.5, 4
+"""Least and largest median ratio of a body's bone lengths to the mean person's; least number of observed bones to judge
+it. Some trackers give every joint the same position, often zero, in frames in which they fail."""
 UNIT_TOLERANCE = 0.01
 """Largest deviation from 1 of the norm of a sensor's quaternion."""
 
@@ -83,8 +84,8 @@ def canonical_bodies(
             counters["body_id_repeated"] += 1
             continue
         positions, confidence = _canonical(body, layout, counters)
-        if _is_too_large(positions):
-            counters["body_too_large"] += 1
+        if not MIN_SIZE <= (size := _size_of(positions)) <= MAX_SIZE:
+            counters["body_too_large" if size > MAX_SIZE else "body_too_small"] += 1
             continue
         bodies[key] = BodyJoints(sensor.to_world(positions), confidence)
     return bodies
@@ -103,11 +104,14 @@ def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple
     return to_canonical(layout, joints, confidence)
 
 
-def _is_too_large(positions: Floats) -> bool:
-    """Whether joints (22, 3) are too large for a person. One such frame would spoil running estimates for seconds."""
+def _size_of(positions: Floats) -> float:
+    """Return the median ratio of the bone lengths of joints (22, 3) to the mean person's; 1 if too few are observed.
+
+    One frame of another size would spoil running estimates for seconds.
+    """
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     observed = np.isfinite(lengths)
-    return bool(observed.sum() >= MIN_BONES and median(lengths[observed] / _REST_LENGTHS[observed]) > MAX_SIZE)
+    return median(lengths[observed] / _REST_LENGTHS[observed]) if observed.sum() >= MIN_BONES else 1.0
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, place_joints, solve_pose
-from steadypose.prior.body.skeleton import BONES_BETWEEN, PARENT
+from steadypose.prior.body.skeleton import BONES_BETWEEN, JOINTS, PARENT, J
 from steadypose.prior.clean.bones import SensorBias
 from steadypose.prior.clean.frame import Estimate, Imputed, Person
 from steadypose.prior.clean.history import BRIEF_S
@@ -31,6 +31,9 @@ collars)."""
 
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 """(22, 22) weight of one joint's error in the correction of another, from the number of bones between them."""
+
+_CHEST = J["spine3"]
+_TRUNK = np.isin(JOINTS, ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"))
 
 _MIN_VARIANCE = 1e-10
 """Least variance of a position, m²: a hundredth of a millimetre squared."""
@@ -221,7 +224,10 @@ def _align(body, seen, precision):
 
 @njit(cache=True)
 def _between(unseen_s):
-    """(S, 22) which joints have joints that the sensor has on at least two sides."""
+    """(S, 22) which joints have joints that the sensor has on at least two sides.
+
+    Arms and head alone do not determine the trunk: the chest would turn about the line of the shoulders.
+    """
     between = np.zeros(unseen_s.shape, dtype=np.bool_)
     below = np.empty(unseen_s.shape[1], dtype=np.int64)
     for row in range(len(unseen_s)):
@@ -233,11 +239,12 @@ def _between(unseen_s):
             total += known
             if joint > 0:
                 below[PARENT[joint]] += below[joint]
+        rooted = below[_CHEST] < total
         for joint in range(len(below)):
             branches = 1 if below[joint] < total else 0
             for other in range(1, len(below)):
                 branches += PARENT[other] == joint and below[other] > 0
-            between[row, joint] = branches >= 2
+            between[row, joint] = branches >= 2 and (rooted or not _TRUNK[joint])
     return between
 
 
@@ -299,15 +306,25 @@ def _stated(unseen_s, deviation, precision, derived):
     """(S, 22) standard deviations of the output.
 
     For a hidden joint, the errors of smoother and prior are dependent, as both use the same past. The smaller deviation
-    of the two is used. Joints ``derived`` (S, 22) have `DERIVED_SIGMA`.
+    of the two is used. Joints ``derived`` (S, 22) have `DERIVED_SIGMA`, and a share of the variances of joints that the
+    sensor has but that are hidden.
     """
     sigma = np.empty_like(unseen_s)
+    joints = sigma.shape[1]
     for row in range(len(sigma)):
-        for joint in range(sigma.shape[1]):
+        for joint in range(joints):
             if unseen_s[row, joint] == 0.0 and np.isfinite(deviation[row, joint]):
                 sigma[row, joint] = deviation[row, joint]
-            elif derived[row, joint]:
-                sigma[row, joint] = DERIVED_SIGMA
             else:
                 sigma[row, joint] = 1.0 / math.sqrt(max(precision.seen[row, joint], precision.prior[row, joint]))
+        for joint in range(joints):
+            if not derived[row, joint]:
+                continue
+            total = hidden = 0.0
+            for other in range(joints):
+                if unseen_s[row, other] < np.inf:
+                    total += _NEAR[joint, other]
+                    if unseen_s[row, other] > 0.0:
+                        hidden += _NEAR[joint, other] * sigma[row, other] ** 2
+            sigma[row, joint] = math.sqrt(DERIVED_SIGMA**2 + hidden / total)
     return sigma

@@ -30,7 +30,8 @@ _JITTER_FRAMES = 15  # length of the running mean of the jitter, frames
 _UNIT_DISTANCE = 2.6  # median distance to the filter's prediction in white noise with sigma 1 along each axis
 _MEAN_FRAMES, _MEAN_FACTOR = 9, 3.0  # length of a joint's running mean distance, frames; threshold as multiple of it
 _HIDDEN_SPEED = 4.0  # speed that a joint at rest may reach while it is hidden, m/s
-_BODY_JUMP = 0.5  # share of joints that jump at once above which the whole body jumped (a new track, a gap)
+_BODY_JUMP = 0.5  # share of joints that jump at once above which the whole body jumped (a bad frame, a new track)
+_BAD_FRAMES = 6  # largest number of frames in a row in which a body that jumped is rejected
 
 
 class Gate:
@@ -40,7 +41,7 @@ class Gate:
     A constant-velocity Kalman filter, updated with the accepted joints, predicts each joint. A joint far from its
     prediction is still accepted if its bones kept their lengths and the sensor's bone lengths are constant enough to
     tell (`BoneOutliers`). No jump is rejected for longer than ``patience``: by then the prediction is wrong, not the
-    sensor.
+    sensor. A body that jumps as a whole is rejected for a few frames only, and not after a gap.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -56,6 +57,7 @@ class Gate:
         self._lost = np.zeros((slots, 22))
         self._refused = np.zeros((slots, 22))
         self._swapped = np.zeros((slots, len(_EXCHANGED)))
+        self._bad_frames = np.zeros(slots)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
@@ -71,6 +73,7 @@ class Gate:
         self._lost[slot] = 0
         self._refused[slot] = 0
         self._swapped[slot] = 0
+        self._bad_frames[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
         """Return the newest frame without rejected joints."""
@@ -87,9 +90,11 @@ class Gate:
         expected = self._filter.predict(observation.stamp_s)
         if expected is not None:
             distance = _apart(positions, expected.positions)
+            jitter = self._jitter.copy()
             self._measure_jitter(distance)
             if s.enabled:
                 mirrored = self._reject(positions, expected, distance, observation.sensor_position)
+                self._jitter = np.where(self._bad_frames > 0, jitter, self._jitter)
         self._lost = np.where(np.isfinite(observation.positions[..., 0]), 0, self._lost + 1)
         self._filter.update(positions, observation.stamp_s)
         return Gated(observation, positions, self._jitter.copy(), frozen | mirrored)
@@ -110,12 +115,21 @@ class Gate:
         seen = np.isfinite(positions[..., 0])
         # a fast limb is far from its prediction in every frame, a joint that jumps only once
         least = np.maximum(np.maximum(s.jump, _JUMP_FACTOR * self._jitter)[:, None], _MEAN_FACTOR * self._mean_distance)
-        self._mean_distance += np.where(seen & known, distance - self._mean_distance, 0.0) / _MEAN_FRAMES
         # a joint may have changed its velocity while it was hidden
         speed = np.maximum(2 * np.linalg.norm(self._filter.velocity, axis=-1), _HIDDEN_SPEED)
-        jumped = seen & known & (distance > least + speed * self._lost / FPS + 3 * expected.sigma)
+        away = self._lost / FPS * speed + 3 * expected.sigma
+        away[self._bad_frames > 0] = 0.0  # frames interpolated from a bad one are bad too, but nearer
+        jumped = seen & known & (distance > least + away)
         everywhere = jumped.sum(axis=1) > _BODY_JUMP * np.maximum((seen & known).sum(axis=1), 1)
-        self._restart(everywhere[:, None] & jumped)
+        self._bad_frames = np.where(everywhere & ~self._lost.all(axis=1), self._bad_frames + 1, 0)
+        self._bad_frames[self._bad_frames > _BAD_FRAMES] = 0
+        bad = self._bad_frames > 0
+        counts = seen & known & ~bad[:, None]
+        self._mean_distance += np.where(counts, distance - self._mean_distance, 0.0) / _MEAN_FRAMES
+        if bad.any():
+            self._counters["joints_refused"] += int(seen[bad].sum())
+            positions[bad] = np.nan
+        self._restart((everywhere & ~bad)[:, None] & jumped)
         jumped &= ~everywhere[:, None] & ~self._bones.intact(positions, distance)
         self._refused = np.where(jumped, self._refused + 1, 0)
         overruled = self._refused > s.patience * FPS

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import limbs
+from steadypose.prior.body.skeleton import HIPS, J, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe, stand
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
@@ -32,9 +32,10 @@ this correction 0.9 to 1.1 (validation)."""
 
 _LEGS, _UNSEEN_LEG = limbs(("knee", "ankle", "foot")), 1.4
 _ARMS, _UNSEEN_ARM = limbs(("shoulder", "elbow", "wrist")), 1.6
-"""Limbs, and factors on the completion's deviation for the joints below a leg's hip and an arm's shoulder if no joint
-of that limb was ever observed. Without them, the error-to-sigma ratio on validation people is 1.4 for legs, 1.46 for
-elbows and 1.73 for wrists."""
+_WAIST, _UNSEEN_WAIST = [*HIPS, J["spine1"], J["spine2"]], 2.0
+"""Parts of the body, and factors on the completion's deviation for hips and lower spine, and for the joints below a
+leg's hip and an arm's shoulder, if no joint of that part was ever observed. Without them, the error-to-sigma ratio on
+validation people is 1.7 to 2.2 for hips and lower spine, 1.4 for legs, 1.46 for elbows and 1.73 for wrists."""
 
 _OF_ARMS = np.isin(np.arange(22), np.ravel(_ARMS))
 
@@ -155,7 +156,7 @@ class OccludedJoints:
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, placed[never]]),
-            np.concatenate([between, (_of_unseen_limbs(never) * completed_sigma)[never]]),
+            np.concatenate([between, (_of_unseen_parts(never) * completed_sigma)[never]]),
         )
 
     def _place_arms(
@@ -216,10 +217,11 @@ def _of_bridged(stated: Floats, occluded: Bools, seen_later: Bools, bridged: Flo
     return deviations
 
 
-def _of_unseen_limbs(never: Bools) -> Floats:
-    """(B, 22) `_UNSEEN_LEG` or `_UNSEEN_ARM` for joints of limbs whose joints were all ``never`` (B, 22) observed, 1
-    for the others."""
+def _of_unseen_parts(never: Bools) -> Floats:
+    """(B, 22) `_UNSEEN_LEG`, `_UNSEEN_ARM` or `_UNSEEN_WAIST` for joints of parts whose joints were all ``never``
+    (B, 22) observed, 1 for the others."""
     factors = np.ones(never.shape)
+    factors[:, _WAIST] = np.where(never[:, _WAIST].all(axis=1), _UNSEEN_WAIST, 1.0)[:, None]
     for leg in _LEGS:
         factors[:, leg] = np.where(never[:, leg].all(axis=1), _UNSEEN_LEG, 1.0)[:, None]
     for _, *arm in _ARMS:

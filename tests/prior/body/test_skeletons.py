@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS, add_layouts, get_skeleton, to_canonical
-from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, REST_POSITIONS, J
 
 EXPECTED_COUNTS = {
     "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,
@@ -49,12 +49,31 @@ def test_a_joint_with_a_missing_source_is_unobserved_and_confidence_is_the_least
     confidence[:, coco.index("left_hip")] = 0.4
     positions[2, coco.index("right_hip"), 1] = np.inf
     mapped, trust = to_canonical(coco, positions, confidence)
-    assert np.allclose(mapped[0, 0], (positions[0, coco.index("left_hip")] + positions[0, coco.index("right_hip")]) / 2)
+    hips, shoulders = (
+        (positions[0, coco.index(f"left_{part}")] + positions[0, coco.index(f"right_{part}")]) / 2
+        for part in ("hip", "shoulder")
+    )
+    assert np.allclose(mapped[0, 0], hips + 0.15 * (shoulders - hips))
+    assert np.allclose(mapped[0, J["neck"]], shoulders + 0.1 * (shoulders - hips))
     assert trust[0, 0] == pytest.approx(0.4)
     assert np.isnan(mapped[2, 0]).all()
     assert trust[2, 0] == 0.0
     assert np.isfinite(mapped[2, J["left_hip"]]).all()
     assert np.isnan(mapped[:, J["spine2"]]).all()
+
+
+@pytest.mark.parametrize("name", ["coco17", "blazepose33", "h36m17", "openpose25", "halpe26", "zed18"])
+def test_pelvis_and_neck_of_a_mean_person_lie_above_hips_and_shoulders(name: str) -> None:
+    skeleton = get_skeleton(name)
+    joints = np.full((len(skeleton.joints), 3), np.nan)
+    for side in ("left", "right"):
+        for part in ("hip", "shoulder"):
+            weights = skeleton.to_canonical[J[f"{side}_{part}"]]
+            joints[weights.argmax()] = REST_POSITIONS[J[f"{side}_{part}"]]
+    mapped, _ = to_canonical(skeleton, joints)
+    assert np.linalg.norm(mapped[0] - REST_POSITIONS[0]) < 0.005
+    if "neck" in skeleton.table and not isinstance(skeleton.table["neck"], str):
+        assert np.linalg.norm(mapped[J["neck"]] - REST_POSITIONS[J["neck"]]) < 0.015
 
 
 def test_canonical_maps_to_itself() -> None:
@@ -88,8 +107,7 @@ def test_other_names_and_means() -> None:
     add_layouts({"own6": {"joints": joints, "canonical": table}})
     mapped = SKELETONS["own6"].table
     assert mapped["head"] == "Top"
-    assert mapped["pelvis"] == {"hl": 1.0, "hr": 1.0}
-    assert mapped["neck"] == {"left_shoulder": 1.0, "right_shoulder": 1.0}
+    assert set(mapped["pelvis"]) == set(mapped["neck"]) == {"hl", "hr", "left_shoulder", "right_shoulder"}
     assert set(mapped["spine3"]) == {"chest", "left_shoulder", "right_shoulder"}
     assert "left_knee" not in mapped
 

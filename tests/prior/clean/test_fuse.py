@@ -7,7 +7,7 @@ import pytest
 from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import RIGID
-from steadypose.prior.body.skeleton import PARENT, J
+from steadypose.prior.body.skeleton import JOINTS, PARENT, J
 from steadypose.prior.clean.fuse import (
     DERIVED_SIGMA,
     Precision,
@@ -83,6 +83,16 @@ def test_between_seen_joints_is_what_has_some_on_two_sides() -> None:
     assert not _completable(np.full((1, 22), 0.1), completed).any(), "a frame that was lost whole"
 
 
+def test_arms_and_head_alone_do_not_determine_the_trunk() -> None:
+    counter = np.full((1, 22), np.inf)
+    counter[0, [J[name] for name in ("left_shoulder", "right_shoulder", "left_wrist", "right_wrist", "head")]] = 0.0
+    trunk = {"spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"}
+    arms = {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
+    assert {JOINTS[joint] for joint in np.flatnonzero(_between(counter)[0])} == arms
+    counter[0, J["left_hip"]] = 5.0
+    assert {JOINTS[joint] for joint in np.flatnonzero(_between(counter)[0])} >= arms | trunk
+
+
 def test_a_completion_is_moved_by_its_error_at_joints_seen_the_nearest_most() -> None:
     seen, completed, body, hidden = waving(1), waving(1), np.zeros((1, 22, 3)), np.zeros((1, 22), dtype=bool)
     hidden[0, WRIST] = True
@@ -117,7 +127,11 @@ def test_of_a_hidden_joint_the_smaller_deviation_is_stated() -> None:
     precision.prior[0, WRIST] = 1 / 0.1**2
     found = _stated(unseen(left_wrist=0.5, left_elbow=0.5, spine2=np.inf), deviation, precision, derived)[0]
     assert found[[SHOULDER, ELBOW, WRIST, KNEE]] == pytest.approx([0.01, 0.2, 0.1, 0.2])
-    assert found[J["spine2"]] == DERIVED_SIGMA
+    assert DERIVED_SIGMA < found[J["spine2"]] < 0.2, "an arm is hidden"
+    seen = _stated(unseen(spine2=np.inf), np.full((1, 22), 0.01), precision, derived)[0]
+    assert seen[J["spine2"]] == DERIVED_SIGMA
+    hips = _stated(unseen(spine2=np.inf, pelvis=1.0, left_hip=1.0, right_hip=1.0), deviation, precision, derived)[0]
+    assert hips[J["spine2"]] > 1.5 * found[J["spine2"]], "the hips are nearer"
 
 
 def test_what_is_rigid_across_two_bones_varies_by_both() -> None:

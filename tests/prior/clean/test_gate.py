@@ -104,12 +104,33 @@ def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
     assert counters == {"limbs_exchanged": 3}
 
 
-def test_a_whole_body_that_jumps_is_another_matter_than_its_joints() -> None:
+@pytest.mark.parametrize("bad", [1, 3])
+def test_a_body_that_jumps_for_a_few_frames_is_refused_in_these(bad: int) -> None:
+    positions = noisy(90, 0.01)
+    positions[50 : 50 + bad] += [1.0, 0, 0]
+    passed, counters = run(positions)
+    assert np.isnan(passed[50 : 50 + bad]).all()
+    assert np.array_equal(
+        np.delete(passed, np.s_[50 : 50 + bad], axis=0), np.delete(positions, np.s_[50 : 50 + bad], axis=0)
+    )
+    assert counters == {"joints_refused": 22 * bad}
+
+
+def test_a_body_that_jumped_for_good_is_believed_soon_and_after_a_gap_at_once() -> None:
     positions = noisy(90, 0.01)
     positions[50:] += [1.0, 0, 0]
-    passed, counters = run(positions)
-    assert np.array_equal(passed, positions)
-    assert counters["joints_refused"] == 0
+    refused = np.isnan(run(positions)[0]).all(axis=(1, 2))
+    assert np.flatnonzero(refused).tolist() == [50, 51, 52, 53, 54, 55]
+    positions[45:50] = np.nan
+    assert np.array_equal(run(positions)[0], positions, equal_nan=True)
+
+
+def test_frames_interpolated_from_a_bad_one_are_refused_too() -> None:
+    positions = noisy(90, 0.01)
+    positions[50:53] += np.array([0.5, 1.0, 0.5])[:, None, None] * [1.0, 0, 0]
+    passed, _ = run(positions)
+    assert (np.isnan(passed[50:53, :, 0]).mean(axis=1) > 0.5).all()
+    assert np.array_equal(passed[53:], positions[53:])
 
 
 def test_low_confidence_is_not_seen() -> None:
