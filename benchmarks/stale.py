@@ -5,7 +5,6 @@ _SIGMA = (
 )
 _LAYOUTS = "pelvis and neck of layouts that lack them are placed otherwise since; it measures times"
 _RUNNING = "pelvis and neck of layouts that lack them are placed otherwise since; it is being measured again"
-_VARIANT = "nothing that it measures has changed: HM-VAE's variant, which it does not run, leaves out a new part"
 
 STALE = {
     "counter": _RUNNING,
@@ -18,9 +17,6 @@ STALE = {
     "rotations": _RUNNING,
     "scale": _LAYOUTS,
     "ablations": _SIGMA,
-    "hgvae": _VARIANT,
-    "humor_credit": "fits start from the published rotations since, and joints inform each other; joints of validation "
-    "people, in noise that lasts, went from 24.3 to 23.5 mm by the first",
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
