@@ -47,7 +47,7 @@ class _Newest(NamedTuple):
     left_out: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
     rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
-    imputed: Imputed | None  # the last frames, completed; None if the impute stage is off
+    imputed: Imputed | None  # the last frames, completed; None if no body is
 
 
 class CleanCore:

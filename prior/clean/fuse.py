@@ -91,7 +91,7 @@ class Fuse:
             person: the bodies' bones.
             slow_error: the sensor's bias, estimated so far.
             rotations: (S, 22, 3, 3) local, for joints that are not observed.
-            imputed: (S, 22, 3) and (S, 22), the frame completed by HG-VAE; None if the impute stage is off.
+            imputed: (S, 22, 3) and (S, 22), the frame completed by HG-VAE; None if no body is completed.
             unseen_s: (S, 22) seconds since each joint was last observed, at this frame.
             seen_later: (S, 22) whether each joint was observed in a later frame within the delay.
             present: (S,) which slots hold a body.

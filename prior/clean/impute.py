@@ -29,7 +29,7 @@ SIGMA_SCALE = 1.2
 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:
-    """Complete the last ``frames`` frames of every body that has hidden joints in them.
+    """Complete the last ``frames`` frames of every body that has hidden joints in them; None if no body has.
 
     Args:
         windows: the newest windows; None if no body is present.
@@ -40,6 +40,8 @@ def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed 
         return None
     tracks, reconstruction = windows.tracks, windows.reconstruction
     hidden = np.flatnonzero((tracks.observed[..., -frames:] == 0).any(axis=(-2, -1)))
+    if not len(hidden):
+        return None
     slots, size = windows.slots[hidden], windows.size[hidden]
     tracks = Tracks(*(part[hidden] for part in tracks))
     completed = completed_tracks(tracks, reconstruction.mean[hidden], jitter[slots])[..., -frames:]

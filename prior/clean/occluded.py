@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import HIPS, J, limbs
-from steadypose.prior.compiled import njit
+from steadypose.prior.compiled import median, njit
 from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe, stand
 from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
 from steadypose.prior.models.posture import LivePosture
@@ -114,7 +114,7 @@ class OccludedJoints:
         offsets: Floats,
         track: Track,
     ) -> Placed | None:
-        """Estimate the occluded joints of B bodies; None if there is no completion.
+        """Estimate the occluded joints of B bodies; None if no joint is completed.
 
         A joint is occluded if another joint of its body was observed more recently. A frame without any observation
         therefore occludes no joint. A joint that was never observed is placed halfway between two positions: the
@@ -128,8 +128,7 @@ class OccludedJoints:
             unseen_s: (B, 22) seconds since each joint was last observed.
             seen_later: (B, 22) whether each joint is observed again within the delay.
             completed: (B, 22, 3) metres, from the completion network.
-            completed_sigma: (B, 22) metres along an axis, inf for joints that are not completed; None if imputation is
-                off.
+            completed_sigma: (B, 22) metres along an axis, inf for joints that are not completed; None if no body is.
             offsets: (B, 22, 3) metres, the people's bones.
             track: the observations of all slots.
         """
@@ -138,6 +137,8 @@ class OccludedJoints:
         if completed_sigma is None:
             return None
         known = np.isfinite(completed_sigma + completed[..., 0])
+        if not known.any():
+            return None
         never = known & np.isinf(unseen_s)
         occluded = (
             known & (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(unseen_s + sigma + held[..., 0])
@@ -207,13 +208,11 @@ def _of_bridged(stated: Floats, occluded: Bools, seen_later: Bools, bridged: Flo
     deviation, ``bridged`` (B, 22), is nearer, but it omits errors that last. These count as much as in the deviations
     of the body's ``observed`` joints (B, 22), NaN for others.
     """
-    between = occluded & seen_later & np.isfinite(observed).any(axis=1, keepdims=True)
-    if not between.any():
-        return stated
-    row = np.nonzero(between)[0]
-    less = np.maximum(bridged[between], np.nanmedian(observed[row], axis=1))
     deviations = stated.copy()
-    deviations[between[occluded]] = np.fmin(stated[between[occluded]], less)
+    for k, (row, joint) in enumerate(np.argwhere(occluded)):
+        others = observed[row][np.isfinite(observed[row])]
+        if seen_later[row, joint] and len(others):
+            deviations[k] = np.fmin(stated[k], max(bridged[row, joint], median(others)))
     return deviations
 
 
