@@ -18,10 +18,12 @@ from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.clock import Clock, SystemClock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError, path_setting
+from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.settings import nearest
 
 logger = logging.getLogger(__name__)
@@ -97,13 +99,21 @@ def free_directory(launch: Launch) -> Path | None:
     A restarted live run continues the same recording with its next part, because stamps increase and limits apply to
     the whole recording. A replay would repeat the same stamps, so it gets a new directory. So does a run whose
     directory contains something else.
+
+    Raises:
+        LaunchError, RecordingError, NpzError, CsvError: the source that the launch starts cannot be opened.
     """
     directory = launch.settings(RecorderSettings).directory
     wanted = Path(directory)
-    if not directory or not os.path.lexists(wanted) or (not launch.transport.lossless and _is_recording(wanted)):
+    if not directory or not os.path.lexists(wanted) or (_is_recording(wanted) and not _replays(launch)):
         return None
     others = (wanted.with_name(f"{wanted.name}-{number}") for number in itertools.count(2))
     return next(other for other in others if not os.path.lexists(other))
+
+
+def _replays(launch: Launch) -> bool:
+    own = "pose_input" in launch.nodes
+    return own and not isinstance(open_input(launch.settings(InputSettings), SystemClock()), LiveSource)
 
 
 def _is_recording(directory: Path) -> bool:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -143,10 +144,14 @@ def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(
     raise AssertionError(f"heard only {heard}")
 
 
-def test_a_recording_launch_started_again_records_on(tmp_path: Path, make_launch: Callable[..., Launch]) -> None:
+@pytest.mark.parametrize("lossless", ["true", "false"])
+def test_a_recording_launch_started_again_records_on(
+    tmp_path: Path, make_launch: Callable[..., Launch], recording: Path, lossless: str
+) -> None:
     out = tmp_path / "out"
-    live = make_launch(nodes='["recorder"]', recorder__directory=out, transport__lossless="false")
-    replay = make_launch(nodes='["recorder"]', recorder__directory=out)
+    made = partial(make_launch, recorder__directory=out, transport__lossless=lossless)
+    live = made(nodes='["recorder"]')
+    replay = made(nodes='["pose_input", "recorder"]', input__recording=recording)
     assert free_directory(live) is None
     record(out, walk(3))
     assert free_directory(live) is None, "the next part of the same"
