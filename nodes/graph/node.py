@@ -28,11 +28,11 @@ from contextlib import ExitStack
 from typing import ClassVar
 
 from steadypose.msgs.delivery import DEAF_S, Principals
-from steadypose.msgs.subscriber import SECOND
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.checks.problem import Problem, error
+from steadypose.nodes.checks.wire import check_wire
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
 from steadypose.nodes.graph.health import STALL_NS, Health
@@ -347,19 +347,7 @@ class Node(ABC):
         """Problems with refused frames since the last call."""
         refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
         new, self._refused_before = refused - self._refused_before, refused
-        if second := new.pop(SECOND, 0):
-            yield error(
-                "second_publisher",
-                f"{second} messages came from a second publisher with the same source name, and were refused: "
-                "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
-                "one of the two",
-            )
-        if new:
-            yield error(
-                "not_a_message",
-                f"{new.total()} frames were not valid messages ({', '.join(sorted(new))}): expected the topic, a zero "
-                "byte, a header of 17 bytes, and CDR (docs/other_languages.md)",
-            )
+        return check_wire(new)
 
     def _await_subscribers(self) -> None:
         """Wait until all reliable subscribers are connected, or the node is stopped."""

@@ -83,14 +83,15 @@ class PriorNode(Node):
             if isinstance(self._pipeline, StreamBatch):
                 self._pipeline.heard(source, self.clock.monotonic_ns())
         found = self._checks.problems(now_ns, live=self.timeline is None or self.timeline.is_now)
-        patience_ns = OWN_SOURCE_NS if "pose_input" in self.launch.nodes else FOREIGN_SOURCE_NS
+        own = "pose_input" in self.launch.nodes
+        patience_ns = OWN_SOURCE_NS if own else FOREIGN_SOURCE_NS
         if not self._checks.seen and now_ns - self._started_ns > patience_ns:
             since_s, addresses = (now_ns - self._started_ns) / 1e9, ", ".join(self.launch.addresses("pose_input"))
+            remedy = "see what pose_input reports" if own else "start the tracker, or let it bind that address"
             return [
                 error(
                     "no_source",
-                    f"no {POSE_RAW} since the start {since_s:.0f} s ago: expected a publisher at {addresses}; start "
-                    "the tracker, or let it bind that address",
+                    f"no {POSE_RAW} since the start {since_s:.0f} s ago: expected a publisher at {addresses}; {remedy}",
                 )
             ]
         in_general = self._answers.problems()

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Protocol
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, warning
+from steadypose.nodes.checks.problem import Problem, error, warning
+from steadypose.nodes.checks.wire import check_wire
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.settings import LaunchError, check_addresses
 from steadypose.nodes.sources.source import (
@@ -171,6 +172,8 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSourc
 
 LATE_S = 1.0
 """Age beyond which a camera's skeletons are not merged, seconds."""
+ENOUGH = 10
+"""Smallest number of a camera's frames to judge by."""
 
 
 @dataclass(frozen=True)
@@ -204,13 +207,15 @@ class MergeSource(LiveSource):
         self._merge = Merge()
         self._received: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
+        self._unread: Counter[str] = Counter()
+        self._before = [Counter[str]()] * 3
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
         context = self._context
         with Subscriber(
             self._addresses, POSE_RAW, keys=context.keys, clear_text=context.clear_text, lifespan_s=LATE_S, name="merge"
         ) as subscriber:
-            self._lost = subscriber.dropped
+            self._lost, self._unread = subscriber.dropped, subscriber.refused
             while True:
                 received = subscriber.receive(POLL_S)
                 if received is None or not isinstance(received[1], PoseRaw):
@@ -219,6 +224,33 @@ class MergeSource(LiveSource):
                 self._received[received[1].source] += 1
                 yield from self._merge.update(received[1]) or [None]
                 self.refused = self._merge.counters + subscriber.refused
+
+    def problems(self) -> list[Problem]:
+        """Problems since the last call, because of which a camera is not merged."""
+        counts = [self._unread, self._merge.counters, self._received]
+        unread, refused, received = (now - before for now, before in zip(counts, self._before, strict=True))
+        self._before = [count.copy() for count in counts]
+        found = list(check_wire(unread))
+        if unplaced := [camera for camera in received if refused[f"not calibrated, {camera}"]]:
+            found.append(
+                error(
+                    "camera_uncalibrated",
+                    f"{', '.join(unplaced)}: not merged, because nobody knows where it stands: expected the "
+                    "[input.calibration] that `steadypose calibrate pose` writes, in its own launch file "
+                    "(docs/calibrate.md)",
+                )
+            )
+        late = {camera: refused[f"late or repeated, {camera}"] for camera in received}
+        if behind := [camera for camera, n in late.items() if n >= ENOUGH and n > received[camera] / 2]:
+            found.append(
+                error(
+                    "camera_late",
+                    f"{', '.join(behind)}: hardly merged, because by their stamps most frames come after later ones "
+                    "of another camera were merged: expected clocks that agree within a few milliseconds; synchronise "
+                    "them (NTP or PTP), or use a faster network",
+                )
+            )
+        return found
 
     def status(self) -> dict[str, str]:
         cameras = {f"camera.{name}": f"{count} messages" for name, count in sorted(self._received.items())}

@@ -298,6 +298,13 @@ class TestNode:
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "pose_input" in from_values(node.diagnostics().values)["no_source"]
 
+    def test_a_launch_file_s_own_source_that_never_came(
+        self, make_launch: Callable[..., Launch], clock: VirtualClock
+    ) -> None:
+        node = PriorNode(make_launch(nodes='["pose_input", "prior"]'), clock)
+        clock.time_ns += 11 * SECOND_NS
+        assert "see what pose_input reports" in from_values(node.diagnostics().values)["no_source"]
+
     def test_a_trajectory_without_a_prior(self, make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
         alone, beside = (
             TrajectoryNode(make_launch(nodes=nodes), clock) for nodes in ('["trajectory"]', '["prior", "trajectory"]')

@@ -87,6 +87,37 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
     frames.close()
 
 
+@pytest.mark.parametrize(
+    ("change", "cause", "words"),
+    [
+        (lambda it: dataclasses.replace(it, calibrated=False), "camera_uncalibrated", "right: not merged"),
+        (lambda it: dataclasses.replace(it, stamp_ns=it.stamp_ns - 300_000_000), "camera_late", "right: hardly merged"),
+        (lambda it: dataclasses.replace(it, source="left"), "second_publisher", "give each sensor its own name"),
+    ],
+    ids=["uncalibrated", "a clock behind", "one name"],
+)
+def test_a_camera_that_is_not_merged_is_a_problem(
+    folder: Path, clock: VirtualClock, change: Callable[[PoseRaw], PoseRaw], cause: str, words: str
+) -> None:
+    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
+    source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
+    frames = source.frames()
+    with Publisher(addresses[0]) as left, Publisher(addresses[1]) as right:
+        assert next(frames) is None
+        for publisher in (left, right):
+            assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
+        for index, views in enumerate(zip(filmed("left", range(0)), filmed("right", range(0)), strict=True), start=1):
+            left.publish(POSE_RAW, views[0])
+            right.publish(POSE_RAW, change(views[1]))
+            while source._received.total() + source._unread.total() < 2 * index:
+                next(frames)
+        (problem,) = source.problems()
+        assert problem.cause == cause
+        assert words in problem.text
+        assert not source.problems(), "until it happens again"
+    frames.close()
+
+
 @pytest.mark.parametrize("cameras", ["[]", '["tcp://127.0.0.1:7111"]', '["ipc:///a", "ipc:///a"]'])
 def test_fewer_than_two_cameras_are_refused(make_launch: Callable[..., Launch], cameras: str) -> None:
     launch = make_launch(input__source="merge", input__merge__cameras=cameras)
