@@ -14,6 +14,7 @@ from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.threads import one_thread
+from steadypose.nodes.graph.topology import NODES, load
 from steadypose.nodes.settings import launch_errors
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
@@ -53,6 +54,8 @@ class PriorNode(Node):
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters)
         self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=clients or 1)
+        # such a replay has no timeline
+        self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
         self._started_ns = self.clock.now_ns()
         self._limit = BodyLimit(settings.max_bodies, self.clock)
 
@@ -82,7 +85,8 @@ class PriorNode(Node):
             self._checks.heard(source, now_ns)
             if isinstance(self._pipeline, StreamBatch):
                 self._pipeline.heard(source, self.clock.monotonic_ns())
-        found = self._checks.problems(now_ns, live=self.timeline is None or self.timeline.is_now)
+        live = not self._unpaced and (self.timeline is None or self.timeline.is_now)
+        found = self._checks.problems(now_ns, live=live)
         own = "pose_input" in self.launch.nodes
         patience_ns = OWN_SOURCE_NS if own else FOREIGN_SOURCE_NS
         if not self._checks.seen and now_ns - self._started_ns > patience_ns:

@@ -278,6 +278,17 @@ class TestNode:
         assert news.level == Level.OK
         assert not from_values(news.values)
 
+    @pytest.mark.parametrize("rate", [0, 1])
+    def test_as_fast_as_possible_stamps_and_clock_part(
+        self, make_launch: Callable[..., Launch], clock: VirtualClock, rate: int
+    ) -> None:
+        node = PriorNode(make_launch(nodes='["pose_input", "prior"]', input__rate=rate), clock)
+        clock.time_ns, frames = START_NS, walk(2.0)
+        self.play(node, clock, frames[:40])
+        clock.time_ns += 600_000_000
+        news = self.play(node, clock, frames[40:])
+        assert set(from_values(news.values)) == (set() if rate == 0 else {"clock_jumped"})
+
     def test_a_problem_is_the_level_and_the_message(self, node: PriorNode, clock: VirtualClock) -> None:
         news = self.play(node, clock, [dataclasses.replace(raw, skeleton="octopus") for raw in walk()])
         assert news.level == Level.ERROR
