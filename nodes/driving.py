@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.checks.problem import Problem, observed
-from steadypose.nodes.checks.stamps import check_length
+from steadypose.nodes.checks.stamps import check_back, check_length
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
@@ -74,7 +74,7 @@ class Diagnosis:
         self._check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
-        self._last_ns = 0
+        self._last_ns = self._span_ns = self._back_ns = 0
         self._useless = False
         self._inhabited = False
         self._looks = self._lying = 0
@@ -83,7 +83,10 @@ class Diagnosis:
     def see(self, raw: PoseRaw) -> None:
         """Add the next frame without examining it yet."""
         self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
-        self._first_ns = raw.stamp_ns if self._first_ns is None else self._first_ns
+        if self._first_ns is None:
+            self._first_ns = self._last_ns = raw.stamp_ns
+        self._span_ns = max(self._span_ns, abs(raw.stamp_ns - self._first_ns))
+        self._back_ns = max(self._back_ns, self._last_ns - raw.stamp_ns)
         self._last_ns = raw.stamp_ns
         self._inhabited |= bool(raw.bodies)
         self.frames += 1
@@ -98,11 +101,13 @@ class Diagnosis:
         return self._note(found)
 
     def end(self) -> list[str]:
-        """End the stream; another may follow. Returns as `look`, including whether the stream was too short."""
+        """End the stream; another may follow. Returns as `look`, including whether it went back or was too short."""
         new = self.look()
+        if "stamps_out_of_order" not in self.problems:
+            new += self._note(check_back(self._back_ns))
         if self._first_ns is not None and not self.problems:
-            new += self._note(check_length(self._first_ns, self._last_ns, self._delay_frames))
-        self._first_ns = None
+            new += self._note(check_length(self._span_ns, self._delay_frames))
+        self._first_ns, self._span_ns, self._back_ns = None, 0, 0
         return new
 
     def answer(self, asked: int, given: int) -> list[str]:

@@ -82,12 +82,23 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
         yield from _against_clock(arrivals, stamps)
 
 
-def check_length(first_ns: int, last_ns: int, delay_frames: int) -> Iterator[Problem]:
-    """The problem with a stream that ends before the delay is filled, given its first and last stamp."""
-    if last_ns - first_ns < (delay_frames - 0.5) * SECOND_NS / FPS:  # stamps are rounded
+def check_back(back_ns: int) -> Iterator[Problem]:
+    """The problem with a recording whose stamps go back by ``back_ns`` at most, from one frame to the next."""
+    if back_ns > STEP_NS:
+        yield warning(
+            "stamps_back",
+            f"stamps go back by {back_ns / SECOND_NS:.1f} s, so the stream starts anew there, and where the times "
+            "before and after overlap, the poses of both are mixed: expected increasing stamps; cut the recording "
+            "there, and clean its parts one by one",
+        )
+
+
+def check_length(span_ns: int, delay_frames: int) -> Iterator[Problem]:
+    """The problem with a stream that ends before the delay is filled, given the time that its stamps span."""
+    if span_ns < (delay_frames - 0.5) * SECOND_NS / FPS:  # stamps are rounded
         yield warning(
             "short",
-            f"the stream lasts {(last_ns - first_ns) / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
+            f"the stream lasts {span_ns / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
             "standard deviations are too small, because the sensor's error in depth is not estimated yet; expected a "
             "longer stream, or a shorter delay",
         )

@@ -164,7 +164,7 @@ class Cleaned:
 
     Attributes:
         frames: of the input.
-        duration_s: from its first stamp to its last.
+        duration_s: of the input; steps of its stamps back do not count.
         spent_s: computing time.
         poses: number of poses in the output; 0 if no body was recognised.
         refused: what was refused or dropped, by cause.
@@ -233,7 +233,7 @@ def clean_recording(
             part.replace(events)
     return Cleaned(
         frames=len(run.stamps_ns),
-        duration_s=float(np.ptp(run.stamps_ns)) / 1e9,
+        duration_s=float(min(np.ptp(run.stamps_ns), np.diff(run.stamps_ns).clip(0).sum())) / 1e9,
         spent_s=time.perf_counter() - started,
         poses=run.poses,
         refused=dict(run.refused),

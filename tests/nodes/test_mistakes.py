@@ -18,6 +18,7 @@ from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.library.arrays import sections, source_of
 
 FRAMES = 50
+TICKS = np.arange(FRAMES) * 33_333_333
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +110,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         r"expected sections 'prior', 'trajectory', 'events'.*got 'prior\.delay', did you mean 'prior'",
     ),
     "a rate and stamps": (
-        lambda j: steadypose.clean(j, fps=30, stamp_ns=np.arange(FRAMES) * 33_333_333),
+        lambda j: steadypose.clean(j, fps=30, stamp_ns=TICKS),
         "or stamp_ns, got both; leave fps out",
     ),
     "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
@@ -160,6 +161,10 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "shorter than the delay": (
         lambda j: steadypose.clean(j[:4], fps=30),
         "lasts 0.10 s, less than the delay of 4 frames",
+    ),
+    "a clock that is set back": (
+        lambda j: steadypose.clean(j, stamp_ns=np.where(np.arange(FRAMES) < 20, 500, 0) * 10**9 + TICKS),
+        "stamps go back by 500.0 s",
     ),
     "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
 }
