@@ -246,6 +246,15 @@ def test_a_layout_for_another_of_as_many_joints(named: str, meant: str) -> None:
     assert f"expected skeleton {meant!r}" in told(frames)["wrong_order"][2]
 
 
+@pytest.mark.parametrize("identified", [False, True])
+def test_what_the_ids_say_counts_only_where_they_are_used(identified: bool) -> None:
+    check = StreamCheck(8, identified=identified)
+    for index, raw in enumerate(walk()):
+        check.see(ONE_ID_IN_TURN(raw, index), raw.stamp_ns)
+    found = [problem.cause for problem in check.problems(START_NS + 3 * SECOND_NS, live=True)]
+    assert found == ([] if identified else ["jumps"])
+
+
 def test_a_short_hold_up_is_no_clock_that_was_set() -> None:
     check = StreamCheck(8)
     for index, raw in enumerate(walk()):
