@@ -57,9 +57,10 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def port_taken(section: str, host: str, port: int, error: OSError) -> str:
+def port_taken(section: str, host: str, port: int, error: Exception) -> str:
     """The error text for a port that cannot be opened."""
+    cause = error.strerror if isinstance(error, OSError) else error
     return (
-        f"[{section}] port {port} at {host} is not to be had ({error.strerror}): another one may be running; close it, "
+        f"[{section}] port {port} at {host} is not to be had ({cause}): another one may be running; close it, "
         f"or set another [{section}] port"
     )

@@ -19,6 +19,7 @@ from steadypose.nodes.ros2 import check_ros, connect
 from steadypose.nodes.ros2.definitions import Connection, Publish, ros_types
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.ros2 import HOST, FoxgloveSettings, Ros2BridgeSettings
+from steadypose.nodes.sinks.serving import port_taken
 
 if TYPE_CHECKING:
     from steadypose.nodes.sinks.ros2.messages import BodyTopics
@@ -88,7 +89,7 @@ class FoxgloveOutput:
                 name="steadypose", host=HOST, port=port, server_listener=Latch(), context=self._context
             )
         except (OSError, RuntimeError) as error:
-            raise LaunchError(f"[foxglove] port {port} cannot be opened: {error}") from error
+            raise LaunchError(port_taken("foxglove", HOST, port, error)) from error
 
     @property
     def url(self) -> str:

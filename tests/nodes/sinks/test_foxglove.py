@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 
 import pytest
@@ -13,6 +14,8 @@ from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import deserialise, new, serialise
+from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.sinks.ros2 import HOST
 from steadypose.nodes.sinks.ros2.bridge import FoxgloveNode, FoxgloveOutput
 
 pytest.importorskip("foxglove", reason="the extra 'foxglove' is not installed")
@@ -42,3 +45,8 @@ def test_who_subscribes_late_gets_what_is_latched() -> None:
         assert deserialise(got, "std_msgs/msg/String").data == "at last"
     finally:
         output.close()
+
+
+def test_a_port_that_is_taken_is_said_with_what_to_do() -> None:
+    with socket.create_server((HOST, 0)) as other, pytest.raises(LaunchError, match=r"set another \[foxglove\] port"):
+        FoxgloveOutput(other.getsockname()[1])
