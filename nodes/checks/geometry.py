@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import Pose, PoseRaw
+from steadypose.msgs.types import Level, Pose, PoseRaw
 from steadypose.nodes.checks.problem import Problem, bodies, error, observed, tracks, warning
 from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.kinematics import SensorFrame
@@ -72,6 +73,8 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
         return
     if not SIZES[0] < like.scale < SIZES[1]:
         yield _unit(like)
+    else:
+        yield from _far(joints)
     stand = stance(skeleton, joints)
     if stand is not None:
         yield from _frame(messages[-1].sensor_pose, stand)
@@ -215,6 +218,22 @@ def _unit(like: Likeness) -> Problem:
         f"the body is {height:.3g} m tall: expected metres, not image coordinates (pixels or normalised); use the "
         "tracker's world coordinates",
     )
+
+
+def _far(joints: Floats) -> Iterator[Problem]:
+    """The problem of bodies, joints (N, J, 3), of which most joints are too far from the sensor to be used."""
+    from steadypose.prior.clean.adapt import MAX_DISTANCE  # imported late: loads 95 MB of numba
+
+    away = np.nanmedian(np.abs(joints).max(axis=-1), axis=1)
+    far = away[np.isfinite(away)] > MAX_DISTANCE
+    if far.sum() >= ENOUGH:
+        found = error(
+            "too_far",
+            f"joints are {np.nanmax(away):.0f} m from the sensor: expected at most {MAX_DISTANCE:.0f} m, and farther "
+            "ones are not used; if these are world coordinates, give sensor_pose and joints relative to it, or "
+            "subtract an origin near the people",
+        )
+        yield found if far.all() else replace(found, level=Level.WARN)
 
 
 def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:

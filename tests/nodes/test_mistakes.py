@@ -162,6 +162,10 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j[:4], fps=30),
         "lasts 0.10 s, less than the delay of 4 frames",
     ),
+    "coordinates of a map, frame by frame": (
+        lambda j: frame_by_frame(j + [35.0, 0.0, 0.0], seconds()),
+        "expected at most 30 m",
+    ),
     "a clock that is set back": (
         lambda j: steadypose.clean(j, stamp_ns=np.where(np.arange(FRAMES) < 20, 500, 0) * 10**9 + TICKS),
         "stamps go back by 500.0 s",

@@ -158,6 +158,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "feet": (scaled(3.281), "unit", "divide by 3.281"),
     "coordinates of an image from 0 to 1": (scaled(0.3), "unit", "world coordinates"),
     "key points of an image, z 0": (scaled(1, 0, 1), "flat", "from_coco"),
+    "coordinates of a map": (joints(lambda it: it + [35, 0, 0]), "too_far", "subtract an origin"),
     "joints relative to the root": (joints(lambda it: it - it[0]), "root_relative", "add the root's place"),
     "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN of a joint"),
     "all joints missing": (joints(lambda it: np.full_like(it, np.nan)), "all_missing", "send no body"),
