@@ -89,9 +89,10 @@ def run(
     # a log file has no width, and a table cut to 80 columns says little
     console = Console(width=None if sys.stdout.isatty() else 140)
     if "recorder" in nodes and (changed := free_directory(settled)):
+        taken = Path(settled.settings(RecorderSettings).directory).name
         overrides.append(f"recorder.directory={_toml(changed)}")
         settled = Launch.read(launch, overrides)
-        console.print(f"recording to {printable(str(changed))}: the folder asked for is there already", soft_wrap=True)
+        console.print(f"recording to {printable(f'{changed}: {taken}')} is there already", soft_wrap=True)
     _check(settled)
     arguments = ["--launch", launch]
     for override in overrides:

@@ -127,6 +127,19 @@ def test_a_path_may_hold_any_character(start: Any, tmp_path: Path) -> None:
         assert reader.count(POSE_RAW) == 31
 
 
+def test_beside_a_file_in_its_place_a_recording_is_made(start: Any, recording: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "mine.npz"
+    taken.touch()
+    run: Run = start(
+        "--input", str(recording), "--record", str(taken), "--rate", "0", *INPUT_ALONE, "--set", "recorder.free_mb=0"
+    )
+    status, output = run.wait()
+    assert status == 0, output
+    assert f"recording to {taken}-2: mine.npz is there already" in output
+    with RecordingReader(tmp_path / "mine.npz-2") as reader:
+        assert reader.count(POSE_RAW) == 91
+
+
 def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(
     recording: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
