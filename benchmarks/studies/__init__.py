@@ -10,6 +10,7 @@ STUDIES: dict[str, str] = {
     "mediapipe": "real MediaPipe beside four cameras",
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
+    "layouts": "joints that COCO's and other layouts lack; the same behind a counter",
     "interpolation": "motion in gaps of 5 to 45 frames (HM-VAE, table 2)",
     "completion": "a part of the body from the rest",
     "hgvae": "likelihood, anomalies, imputation (the HG-VAE paper)",
