@@ -45,6 +45,9 @@ MAX_NEW_SUBSCRIPTIONS = 256
 REBIND_S = 5.0
 """Longest time to wait for our own address, seconds. ZeroMQ releases it in a thread, soon after the socket closes."""
 
+CHECK_S = 1.0
+"""Interval between two enforcements of the list of keys while messages are published, seconds."""
+
 _LOOK_S = 1.0
 """Interval between checks whether a subscriber still has to be waited for, seconds."""
 _CUT = "subscriptions"
@@ -111,7 +114,7 @@ class Publisher(Closing):
         self._listeners: set[Listener] = set()
         self._subscriptions: set[bytes] = set()
         self._new_subscriptions: Counter[int] = Counter()
-        self._new_since = time.monotonic()
+        self._new_since = self._checked_at = time.monotonic()
         self.id = resume.id if resume else int.from_bytes(os.urandom(4), "little")
         """random number that identifies this publisher on the resumed topics (all topics, if nothing is resumed)"""
         self._new_id = int.from_bytes(os.urandom(4), "little")  # so that topics not resumed do not look like repeats
@@ -168,7 +171,10 @@ class Publisher(Closing):
         Raises:
             ValueError: the message is not of the topic's type, encodes to more than `MAX_FRAME` bytes, or holds more
                 bodies, events or values than `msgs.codec` allows.
+            RuntimeError, TransportError: as `check`.
         """
+        if time.monotonic() - self._checked_at > CHECK_S:
+            self.check()
         check_topic(topic, message)
         payload = encode(message)
         check_size(topic, payload)
@@ -214,7 +220,7 @@ class Publisher(Closing):
             self._socket.poll(milliseconds(min(left, _LOOK_S)))
 
     def check(self) -> None:
-        """Enforce the list of keys. Call it about once a second.
+        """Enforce the list of keys, as `publish` does once a second; a publisher that is silent for longer calls it.
 
         If a key was removed since the last call, or a flood of subscriptions was not stopped otherwise, all connections
         are closed, and permitted subscribers reconnect.
@@ -224,6 +230,7 @@ class Publisher(Closing):
                 publisher.
             TransportError: another process took the address meanwhile.
         """
+        self._checked_at = time.monotonic()
         self._note_subscribers()
         if self._authenticator and not self._authenticator.is_alive():
             raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")

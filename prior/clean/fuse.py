@@ -32,7 +32,7 @@ collars)."""
 _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 """(22, 22) weight of one joint's error in the correction of another, from the number of bones between them."""
 
-_CHEST = J["spine3"]
+_CHEST, _PAIRS = J["spine3"], ((J["left_hip"], J["right_hip"]), (J["left_collar"], J["right_collar"]))
 _TRUNK = np.isin(JOINTS, ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"))
 
 _MIN_VARIANCE = 1e-10
@@ -55,9 +55,9 @@ class Fuse:
     """Fuses observed joints with the prior's estimates of the hidden ones.
 
     An observed joint keeps its smoothed and denoised position. A hidden joint gets the weighted mean of several
-    candidates (`OccludedJoints`). A joint without a completion, and a joint that the sensor lacks between observed
-    ones, follows from the observed joints by the decoded rotations. Bone lengths are constrained as far as they are
-    known.
+    candidates (`OccludedJoints`). A joint without a completion, and a joint of the trunk that the sensor lacks between
+    observed ones, follows from the observed joints by the decoded rotations. Bone lengths are constrained as far as
+    they are known.
 
     Attributes:
         occluded: estimates the hidden joints; None if fusion is off.
@@ -133,7 +133,7 @@ class Fuse:
             body = fit_lengths(body, offsets, np.where(stays, _MIN_VARIANCE, variance), length_variance)
             fitted = solve_pose(body, offsets, decoded)[0]
         placed = np.isfinite(deviation).any(axis=1)
-        derived = np.isinf(unseen) & _between(unseen)
+        derived = np.isinf(unseen) & _determined(unseen)
         state, sigma = _states(unseen, known), _stated(unseen, deviation, precision, derived)
         return Estimate(
             stamp_s=smoothed.stamp_s,
@@ -223,12 +223,13 @@ def _align(body, seen, precision):
 
 
 @njit(cache=True)
-def _between(unseen_s):
-    """(S, 22) which joints have joints that the sensor has on at least two sides.
+def _determined(unseen_s):
+    """(S, 22) which joints of the trunk lie between joints that the sensor has, and follow from them.
 
-    Arms and head alone do not determine the trunk: the chest would turn about the line of the shoulders.
+    Not if it has only what is above the chest, or only one side: the trunk could turn. Limbs bend, so their joints do
+    not follow from their neighbours.
     """
-    between = np.zeros(unseen_s.shape, dtype=np.bool_)
+    determined = np.zeros(unseen_s.shape, dtype=np.bool_)
     below = np.empty(unseen_s.shape[1], dtype=np.int64)
     for row in range(len(unseen_s)):
         total = 0
@@ -239,29 +240,33 @@ def _between(unseen_s):
             total += known
             if joint > 0:
                 below[PARENT[joint]] += below[joint]
-        rooted = below[_CHEST] < total
+        both = False
+        for left, right in _PAIRS:
+            both |= below[left] > 0 and below[right] > 0
+        if not both or below[_CHEST] == total:
+            continue
         for joint in range(len(below)):
-            branches = 1 if below[joint] < total else 0
+            sides = 1 if below[joint] < total else 0
             for other in range(1, len(below)):
-                branches += PARENT[other] == joint and below[other] > 0
-            between[row, joint] = branches >= 2 and (rooted or not _TRUNK[joint])
-    return between
+                sides += PARENT[other] == joint and below[other] > 0
+            determined[row, joint] = _TRUNK[joint] and sides >= 2
+    return determined
 
 
 @njit(cache=True)
 def _completable(unseen_s, completed):
     """(S, 22) which joints are hidden and get a completion.
 
-    Two groups are excluded. The neighbours of a joint that the sensor lacks determine it better, if it lies between
-    joints that the sensor has. In frames without any observation, the smoother is more accurate.
+    Two groups are excluded. Joints of the trunk that the sensor lacks may follow from those that it has. In frames
+    without any observation, the smoother is more accurate.
     """
-    hidden, between = np.zeros(unseen_s.shape, dtype=np.bool_), _between(unseen_s)
+    hidden, determined = np.zeros(unseen_s.shape, dtype=np.bool_), _determined(unseen_s)
     for row in range(len(unseen_s)):
         newest = unseen_s[row].min()
         for joint in range(unseen_s.shape[1]):
             unseen = unseen_s[row, joint]
             if unseen > newest and not math.isnan(completed[row, joint, 0]):
-                hidden[row, joint] = unseen < np.inf or not between[row, joint]
+                hidden[row, joint] = unseen < np.inf or not determined[row, joint]
     return hidden
 
 

@@ -522,6 +522,23 @@ def test_who_is_taken_off_the_list_is_put_out_and_who_is_added_let_in(key_direct
             assert put_out.receive(NEVER_S) is None
 
 
+def test_publishing_puts_out_who_is_taken_off_the_list(
+    key_directories: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(publishing, "CHECK_S", 0.0)
+    directory = key_directories[0]
+    robot, guest, _ = (load_keys(directory) for directory in key_directories)
+    with (
+        Publisher("tcp://127.0.0.1:*", keys=robot) as publisher,
+        Subscriber(publisher.endpoint, POSE_RAW, keys=guest, name="guest") as put_out,
+    ):
+        assert publisher.wait_for_subscribers(["guest"], timeout_s=SOON_S)
+        (directory / "clients" / "guest.key").unlink()
+        publisher.publish(POSE_RAW, raw(7))
+        assert put_out.receive(NEVER_S) is None
+        assert publisher.refused["revoked keys"] == 1
+
+
 def test_each_publisher_may_have_a_key_of_its_own(key_directories: tuple[Path, Path, Path]):
     robot, guest, _ = key_directories
     (guest / "server.key").unlink()

@@ -62,7 +62,7 @@ def test_a_joint_with_a_missing_source_is_unobserved_and_confidence_is_the_least
     assert np.isnan(mapped[:, J["spine2"]]).all()
 
 
-@pytest.mark.parametrize("name", ["coco17", "blazepose33", "h36m17", "openpose25", "halpe26", "zed18"])
+@pytest.mark.parametrize("name", ["coco17", "blazepose33", "h36m17", "openpose25", "halpe26", "zed18", "mhr70"])
 def test_pelvis_and_neck_of_a_mean_person_lie_above_hips_and_shoulders(name: str) -> None:
     skeleton = get_skeleton(name)
     joints = np.full((len(skeleton.joints), 3), np.nan)

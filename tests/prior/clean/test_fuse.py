@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from tests.helpers.bodies import waving
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import JOINTS, PARENT, J
 from steadypose.prior.clean.fuse import (
     DERIVED_SIGMA,
     Precision,
     _align,
-    _between,
     _completable,
     _complete,
+    _determined,
     _merge,
     _of_rigid,
     _stated,
@@ -65,32 +66,42 @@ def test_a_body_is_put_where_most_that_is_seen_of_it_says() -> None:
     np.testing.assert_array_equal(well[0, KNEE], seen[0, KNEE])
 
 
-def test_between_seen_joints_is_what_has_some_on_two_sides() -> None:
-    gone = unseen(left_elbow=np.inf, right_wrist=np.inf, spine2=np.inf, head=np.inf, left_knee=np.inf)
-    for end in ("left_ankle", "left_foot"):
-        gone[0, J[end]] = np.inf
-    between = _between(gone)[0]
-    assert [bool(between[J[name]]) for name in ("left_elbow", "spine2", "pelvis")] == [True, True, True]
-    assert [bool(between[J[name]]) for name in ("right_wrist", "head", "left_knee", "left_foot")] == [False] * 4
-    for joint in range(1, 22):  # seen or not, an inner joint lies between parent and child
-        assert _between(np.zeros((1, 22)))[0, joint] == (joint in PARENT[1:])
-    completed = waving(1)
-    completed[0, KNEE] = np.nan
-    gone[0, [WRIST, KNEE]] = 0.5
-    hidden = _completable(gone, completed)[0]
-    expected = {WRIST, *(J[name] for name in ("right_wrist", "head", "left_knee", "left_ankle", "left_foot"))}
-    assert set(np.flatnonzero(hidden)) == expected
-    assert not _completable(np.full((1, 22), 0.1), completed).any(), "a frame that was lost whole"
+TRUNK = {"pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"}
 
 
-def test_arms_and_head_alone_do_not_determine_the_trunk() -> None:
+def determined(gone: Floats) -> set[str]:
+    return {JOINTS[joint] for joint in np.flatnonzero(_determined(gone)[0])}
+
+
+def test_the_trunk_follows_from_joints_on_two_sides_of_each_and_limbs_do_not() -> None:
+    assert determined(np.zeros((1, 22))) == TRUNK
+    assert determined(unseen(left_elbow=np.inf, left_knee=np.inf, spine2=np.inf)) == TRUNK
+    assert determined(unseen(head=np.inf)) == TRUNK - {"neck"}
+
+
+def test_arms_and_head_alone_and_one_side_alone_do_not_determine_the_trunk() -> None:
+    shown = ["left_shoulder", "right_shoulder", "left_wrist", "right_wrist", "head"]
     counter = np.full((1, 22), np.inf)
-    counter[0, [J[name] for name in ("left_shoulder", "right_shoulder", "left_wrist", "right_wrist", "head")]] = 0.0
-    trunk = {"spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"}
-    arms = {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
-    assert {JOINTS[joint] for joint in np.flatnonzero(_between(counter)[0])} == arms
+    counter[0, [J[name] for name in shown]] = 0.0
+    assert determined(counter) == set()
     counter[0, J["left_hip"]] = 5.0
-    assert {JOINTS[joint] for joint in np.flatnonzero(_between(counter)[0])} >= arms | trunk
+    assert determined(counter) >= TRUNK - {"pelvis"}
+    side = np.full((1, 22), np.inf)
+    side[0, [J[name] for name in ("left_hip", "left_shoulder", "left_ankle", "head")]] = 0.0
+    assert determined(side) == set()
+    side[0, J["right_knee"]] = 0.0
+    assert determined(side) >= {"pelvis", "spine1", "spine2", "spine3"}
+
+
+def test_what_is_hidden_is_completed_but_for_what_follows_and_lost_frames() -> None:
+    gone = unseen(left_elbow=np.inf, right_wrist=np.inf, spine2=np.inf, left_wrist=0.5)
+    completed = waving(1)
+    assert {JOINTS[joint] for joint in np.flatnonzero(_completable(gone, completed)[0])} == {
+        "left_elbow", "right_wrist", "left_wrist"
+    }  # fmt: skip
+    completed[0, WRIST] = np.nan
+    assert not _completable(gone, completed)[0, WRIST]
+    assert not _completable(np.full((1, 22), 0.1), completed).any(), "a frame that was lost whole"
 
 
 def test_a_completion_is_moved_by_its_error_at_joints_seen_the_nearest_most() -> None:
