@@ -1,14 +1,17 @@
 """Results that are kept although what they measured has changed since, each with the reason."""
 
-_LAYOUTS = "pelvis and neck of layouts that lack them are placed otherwise since; it measures times"
-_RUNNING = "pelvis and neck of layouts that lack them are placed otherwise since; it is being measured again"
+_TIMES = "it measures times; since, the pose of somebody who enters the image has changed in one of the bundled streams"
+
+_ENTERS = "in one of the bundled streams, the pose of somebody who enters the image has changed since"
 
 STALE = {
-    "kinect_vicon": _RUNNING,
-    "latency": _LAYOUTS,
-    "restart": _LAYOUTS,
-    "rotations": _RUNNING,
-    "scale": _LAYOUTS,
+    "counter": _ENTERS,
+    "events": _ENTERS,
+    "latency": _TIMES,
+    "restart": _TIMES,
+    "retarget": _ENTERS,
+    "rotations": "the root of `crossing` is off by 8.9 / 19.6 degrees since, where somebody enters; the rest is as here",
+    "scale": _TIMES,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
 """Reason for keeping each study's figures. `tests/benchmarks/test_report.py` compares this list with the code."""
