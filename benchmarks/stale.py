@@ -10,7 +10,7 @@ STALE = {
     "latency": _TIMES,
     "restart": _TIMES,
     "retarget": _ENTERS,
-    "rotations": "the root of `crossing` is off by 8.9 / 19.6 degrees since, where somebody enters; the rest is as here",
+    "rotations": "the root of `crossing` is off by 8.9 / 19.6 degrees since, as somebody enters; the rest is as here",
     "scale": _TIMES,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }
