@@ -2,14 +2,10 @@
 
 _TIMES = "it measures times; since, the pose of somebody who enters the image has changed in one of the bundled streams"
 
-_ENTERS = "in one of the bundled streams, the pose of somebody who enters the image has changed since"
 
 STALE = {
-    "counter": _ENTERS,
-    "events": _ENTERS,
     "latency": _TIMES,
     "restart": _TIMES,
-    "retarget": _ENTERS,
     "rotations": "the root of `crossing` is off by 8.9 / 19.6 degrees since, as somebody enters; the rest is as here",
     "scale": _TIMES,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
