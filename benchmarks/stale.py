@@ -2,7 +2,6 @@
 
 _TIMES = "it measures times; since, the pose of somebody who enters the image has changed in one of the bundled streams"
 
-
 STALE = {
     "latency": _TIMES,
     "restart": _TIMES,

@@ -77,7 +77,10 @@ def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
     seen = body[:, [J[joint] for joint in HALPE.values()]]
     expected = truth[..., [1, 0, 2]] * [1, -1, 1]
     assert np.isnan(seen[1, list(HALPE).index("LWrist")]).all()
+    hip = list(HALPE).index("Hip")  # the middle of the hips; the pelvis lies above
+    np.testing.assert_allclose(seen[:, hip], expected[:, hip], atol=3e-3)
     keep = np.isfinite(seen)
+    keep[:, hip] = False
     np.testing.assert_allclose(seen[keep], expected[keep], atol=1e-4)
     assert np.isnan(body[:, J["spine1"]]).all()
 
@@ -85,7 +88,8 @@ def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
 def test_a_c3d_is_of_joints_or_of_markers_on_the_skin(tmp_path: Path) -> None:
     fps, body = read_motion("take.C3D", c3d(tmp_path / "x.c3d", [f"Anna:{n}" for n in HALPE], points() * 1000))
     assert fps == 100
-    np.testing.assert_allclose(body[:, [J[joint] for joint in HALPE.values()]], points(), atol=1e-4)
+    seen = np.delete(body[:, [J[joint] for joint in HALPE.values()]], list(HALPE).index("Hip"), axis=1)
+    np.testing.assert_allclose(seen, np.delete(points(), list(HALPE).index("Hip"), axis=1), atol=1e-4)
     markers = recording(BENDS[:5], STILL, np.zeros(3))
     markers |= {"LTIB": markers["LANK"], "RTIB": markers["RANK"]}
     millimetres = 1000 * np.stack(list(markers.values()), axis=1)
