@@ -127,10 +127,18 @@ def test_a_body_that_jumped_for_good_is_believed_soon_and_after_a_gap_at_once() 
 
 def test_frames_interpolated_from_a_bad_one_are_refused_too() -> None:
     positions = noisy(90, 0.01)
-    positions[50:53] += np.array([0.5, 1.0, 0.5])[:, None, None] * [1.0, 0, 0]
+    positions[50:53] += np.array([0.6, 0.9, 0.3])[:, None, None] * [1.0, 0, 0]
     passed, _ = run(positions)
     assert (np.isnan(passed[50:53, :, 0]).mean(axis=1) > 0.5).all()
     assert np.array_equal(passed[53:], positions[53:])
+
+
+def test_a_refused_body_says_nothing_of_the_sensors_noise() -> None:
+    positions = noisy(60, 0.01)
+    positions[50] += [1.0, 0, 0]
+    gate = Gate(GateSettings(), 1, Counter())
+    jitter = [gate.update(observation(frame[None], k / 30)).jitter[0] for k, frame in enumerate(positions)]
+    assert jitter[50] == jitter[49]
 
 
 def test_low_confidence_is_not_seen() -> None:
