@@ -155,7 +155,8 @@ def source_of(
         if stated:
             raise NpzError(f"{positions}: expected no {', '.join(stated)} beside a file, which contains it")
         return source
-    if fps is not None and stamp_ns is not None:
+    stamped = stamp_ns is not None or (isinstance(positions, Mapping) and "stamp_ns" in positions)
+    if fps is not None and stamped:
         raise NpzError("expected fps, of a regular stream, or stamp_ns, got both; leave fps out")
     if isinstance(positions, Mapping):
         if "positions" not in positions:
@@ -209,7 +210,7 @@ def clean(
         skeleton: name of the joint layout, such as ``coco17`` (`steadypose.SKELETONS`); default ``smpl22``. Or a custom
             layout: a list of its joints' names, if they are those of smpl22, or a mapping with ``joints`` and
             ``canonical`` as in a launch file (docs/sources.md).
-        confidence: (T, J) or (T, B, J) 0 to 1, if the source provides it.
+        confidence: (T, J) or (T, B, J) 0 to 1, or True where a joint was seen, if the source provides it.
         up: the axis of the positions that points up: ``z`` (default), ``y`` or ``-y``.
         delay: delay of the output, 0 to 16 frames at 30 Hz; more is smoother.
         settings: ``prior``, ``trajectory`` and ``events`` as in a launch file; they take precedence over ``delay``.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any
@@ -116,8 +116,8 @@ class Filter:
                 where B may be 0.
             t: time of capture in seconds, on any clock that only goes forward.
             stamp_ns: time of capture in whole nanoseconds, instead of ``t``.
-            confidence: (J,) or (B, J) 0 to 1, if the source has it.
-            ids: ids of the B bodies, one per person. Default: 0, 1, ….
+            confidence: (J,) or (B, J) 0 to 1, or True where a joint was seen, if the source has it.
+            ids: list of the ids of the B bodies, one per person, integers of 32 bits. Default: 0, 1, ….
             sensor_pose: pose of the sensor in this frame, if the camera moves.
 
         Returns:
@@ -125,7 +125,8 @@ class Filter:
             frames, while nobody is visible, and in some calls if the camera is faster than 30 Hz.
 
         Raises:
-            FilterError: an array has the wrong shape, or there is no time of capture; the frame is not used.
+            FilterError: an array or the ids have the wrong form, or there is not one time of capture; the frame is not
+                used.
         """
         found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
         return found[-1] if found else None
@@ -229,17 +230,18 @@ class Filter:
                 f"joints: expected {MAX_BODIES} bodies of one moment at most, got {len(positions)}; frames go one by "
                 "one, and a whole recording into steadypose.clean"
             )
-        if confidence is None:
-            sure = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
-        else:
-            sure = as_array("confidence", confidence).astype(np.float32)
-            if sure.size != positions.shape[0] * wanted[0]:
-                raise FilterError(f"confidence: expected {positions.shape[:-1]}, got {sure.shape}")
-            sure = sure.reshape(positions.shape[:-1])
-        numbers = list(range(len(positions))) if ids is None else list(ids)
-        different = all(isinstance(id, Integral) for id in numbers) and len(set(numbers)) == len(numbers)
-        if len(numbers) != len(positions) or not different:
-            raise FilterError(f"ids: expected {len(positions)} different integers, one a body, got {list(ids or ())}")
+        sure = np.isfinite(positions).all(axis=-1) if confidence is None else as_array("confidence", confidence)
+        if sure.dtype.kind not in "fiub" or sure.size != positions.shape[0] * wanted[0]:
+            raise FilterError(
+                f"confidence: expected {positions.shape[:-1]} numbers of 0 to 1, got {sure.dtype} of shape {sure.shape}"
+            )
+        sure = np.asarray(sure, np.float32).reshape(positions.shape[:-1])
+        numbers = list(range(len(positions)) if ids is None else ids if isinstance(ids, Iterable) else ())
+        fit = all(isinstance(id, Integral) and -(2**31) <= id < 2**31 for id in numbers)
+        if not fit or not len(set(numbers)) == len(numbers) == len(positions):
+            raise FilterError(
+                f"ids: expected a list of {len(positions)} different integers of 32 bits, one a body, got {ids!r}"
+            )
         bodies = [RawBody(int(id), *parts) for id, *parts in zip(numbers, positions, sure, strict=True)]
         return [body for body in bodies if not (several and np.isnan(body.positions).all())], several
 
@@ -252,7 +254,10 @@ def _check_pose(pose: object) -> None:
 def _stamp(t: float | None, stamp_ns: int | None) -> int:
     """Nanoseconds of capture."""
     if (t is None) == (stamp_ns is None):
-        raise FilterError("expected the time of capture: t in seconds, or stamp_ns; cleaner(joints, time.time())")
+        got = "neither" if t is None else "both"
+        raise FilterError(
+            f"expected the time of capture, as t in seconds or as stamp_ns, got {got}: cleaner(joints, time.time())"
+        )
     if stamp_ns is not None:
         if not isinstance(stamp_ns, Real) or stamp_ns != round(stamp_ns):
             raise FilterError(f"stamp_ns: expected whole nanoseconds, got {stamp_ns!r}; seconds are t")

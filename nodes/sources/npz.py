@@ -1,7 +1,8 @@
 """Poses as plain arrays: from an ``.npz``, also one written by ``steadypose clean``, and from motion capture files.
 
 Required arrays: ``positions`` (T, J, 3) metres, NaN where missing; ``skeleton``, a layout's name; ``stamp_ns`` (T,) or
-``fps``. Optional arrays: ``confidence`` (T, J) 0 to 1; ``up``, the axis that points up (``z``, ``y`` or ``-y``).
+``fps``. Optional arrays: ``confidence`` (T, J) 0 to 1, or True where a joint was seen; ``up``, the axis that points up
+(``z``, ``y`` or ``-y``).
 
 For several bodies: ``positions`` (T, B, J, 3), all NaN where a body is absent; ``confidence`` (T, B, J); and
 ``body_id`` (B,), their ids (default 0, 1, …).
@@ -151,7 +152,7 @@ class ArraySource:
         """(T,) capture times, nanoseconds"""
         confidence = np.asarray(np.isfinite(positions).all(axis=-1), np.float32)
         if "confidence" in arrays:
-            confidence = _numbers(path, arrays, "confidence")
+            confidence = _numbers(path, arrays, "confidence", "fiub")
             if confidence.shape != positions.shape[:-1]:
                 raise NpzError(f"{path}: confidence: expected {positions.shape[:-1]}, got {confidence.shape}")
         self._positions = positions.reshape(frames, -1, joints, 3)
@@ -233,9 +234,9 @@ def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray
     return arrays[name]
 
 
-def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[np.float32]:
+def _numbers(path: Path, arrays: Mapping[str, NDArray[Any]], name: str, kinds: str = "fiu") -> NDArray[np.float32]:
     array = _array(path, arrays, name)
-    if array.dtype.kind not in "fiu":
+    if array.dtype.kind not in kinds:
         raise NpzError(f"{path}: {name}: expected numbers, got {array.dtype}")
     with np.errstate(over="ignore"):  # values too large for float32 become infinite, and are refused later
         return array.astype(np.float32)

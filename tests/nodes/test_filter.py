@@ -154,7 +154,7 @@ def test_a_frame_that_cannot_be_used_leaves_the_stream_as_it_was(joints: np.ndar
         if k == 15:
             with pytest.raises(ValueError, match=r"expected \(22, 3\) metres"):
                 cleaner(frame[:17], stamp_ns=ns)
-            with pytest.raises(ValueError, match="different integers, one a body"):
+            with pytest.raises(ValueError, match="different integers of 32 bits, one a body"):
                 cleaner(joints[k], stamp_ns=ns, ids=[1, 1])
             with pytest.raises(ValueError, match=r"expected steadypose\.Pose"):
                 cleaner(frame, stamp_ns=ns, sensor_pose=np.eye(4))  # type: ignore[arg-type]

@@ -77,6 +77,20 @@ def test_frames_to_complete_may_come_in_any_order_and_lying_bodies_are_warned_of
         assert steadypose.complete(seen[..., [1, 2, 0]], stamp_ns=stamps).problems
 
 
+def test_a_mask_of_what_was_seen_is_a_confidence() -> None:
+    joints = walked(20)
+    seen = np.ones((20, 22), bool)
+    seen[:, 15] = False
+    by_mask = steadypose.clean(joints, fps=30, confidence=seen)
+    by_number = steadypose.clean(joints, fps=30, confidence=seen.astype(float))
+    np.testing.assert_array_equal(by_mask.state, by_number.state)
+    assert (by_mask.state[:, 15] == steadypose.JointState.IMPUTED).all()
+    cleaner = steadypose.Filter(delay=0)
+    live = [cleaner(frame, t / 30, confidence=mask) for t, (frame, mask) in enumerate(zip(joints, seen, strict=True))]
+    assert live[-1] is not None
+    assert live[-1].state[15] == steadypose.JointState.IMPUTED
+
+
 def test_frames_of_confidence_zero_are_not_missed() -> None:
     sure = np.ones(WALK.shape[:2])
     sure[: 4 * FRAMES // 5] = 0.0

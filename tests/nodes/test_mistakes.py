@@ -113,13 +113,21 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j, fps=30, stamp_ns=TICKS),
         "or stamp_ns, got both; leave fps out",
     ),
+    "a rate beside arrays with stamps": (
+        lambda j: steadypose.clean({"positions": j, "skeleton": "smpl22", "stamp_ns": TICKS}, fps=60),
+        "or stamp_ns, got both; leave fps out",
+    ),
     "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
     "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),  # type: ignore[arg-type]
     "a delay of seconds": (
         lambda j: steadypose.clean(j, fps=30, delay=0.1),  # type: ignore[arg-type]
         "expected int such as 4, got 0.1",
     ),
-    "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds, or stamp_ns"),
+    "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds or as stamp_ns, got neither"),
+    "two times of a frame": (
+        lambda j: steadypose.Filter()(j[0], 0.0, stamp_ns=0),
+        "t in seconds or as stamp_ns, got both",
+    ),
     "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
     "many frames at once": (
         lambda j: steadypose.Filter()(np.concatenate([j, j, j]), 0.0),
@@ -135,7 +143,16 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "names for ids": (
         lambda j: steadypose.Filter()(j[:1], 0.1, ids=["anna"]),  # type: ignore[list-item]
-        "ids: expected 1 different integers, one a body, got .'anna'.",
+        "ids: expected a list of 1 different integers of 32 bits, one a body, got .'anna'.",
+    ),
+    "an id that is not in a list": (
+        lambda j: steadypose.Filter()(j[0], 0.1, ids=3),  # type: ignore[arg-type]
+        "one a body, got 3",
+    ),
+    "an id of 64 bits": (lambda j: steadypose.Filter()(j[0], 0.1, ids=[2**31]), r"of 32 bits, .*got .2147483648."),
+    "confidence in words": (
+        lambda j: steadypose.Filter()(j[0], 0.1, confidence=["high"] * 22),  # type: ignore[list-item]
+        r"confidence: expected \(1, 22\) numbers of 0 to 1, got <U4 of shape \(22,\)",
     ),
     "a place for a pose": (
         lambda j: steadypose.Filter(sensor_pose=(0.0, 0.0, 1.4)),  # type: ignore[arg-type]
