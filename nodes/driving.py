@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.checks.problem import Problem, observed
+from steadypose.nodes.checks.problem import Problem, error, observed
 from steadypose.nodes.checks.stamps import check_back, check_length
 from steadypose.nodes.checks.stream import StreamCheck
 from steadypose.nodes.graph.clock import FRAME_NS
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
 """Number of frames between checks of the input, and the time that they are assumed to take, nanoseconds."""
-
-NOBODY = "nobody_recognised: no body in any frame; is the skeleton right, are the units metres?"
-"""Problem text of an input without any recognised body."""
 
 ENOUGH = 8
 """Number of joints of a body that are certainly enough for a pose."""
@@ -76,7 +73,7 @@ class Diagnosis:
         self._first_ns: int | None = None
         self._last_ns = self._span_ns = self._back_ns = 0
         self._useless = False
-        self._inhabited = False
+        self._inhabited = self._anybody = False
         self._looks = self._lying = 0
         self.frames = 0
 
@@ -89,6 +86,7 @@ class Diagnosis:
         self._back_ns = max(self._back_ns, self._last_ns - raw.stamp_ns)
         self._last_ns = raw.stamp_ns
         self._inhabited |= bool(raw.bodies)
+        self._anybody |= bool(raw.bodies)
         self.frames += 1
 
     def look(self) -> list[str]:
@@ -111,17 +109,28 @@ class Diagnosis:
         return new
 
     def answer(self, asked: int, given: int) -> list[str]:
-        """Add whether most frames gave no pose, of which no problem is the reason. Returns as `look`.
+        """Add that no frame, or less than half of them, gave a pose, unless a problem is the reason. Returns as `look`.
 
         Args:
             asked: number of frames at 30 Hz in which the input has a body.
             given: number of those in which the output has one.
         """
-        if not self.trusted or not 0 < given < asked / 2:
+        if not self.trusted or 0 < given >= asked / 2:
             return []
+        if not self._anybody:
+            found = error("nobody", "no frame has a body: expected joints; does the tracker detect people?")
+        elif not given:
+            found = error(
+                "nobody_recognised",
+                "no body in any frame gave a pose: expected one each; is the skeleton right, are the units metres?",
+            )
+        else:
+            found = error(
+                "few_poses",
+                f"{given} of {asked} frames with a body gave a pose: expected nearly all; what is not used is counted",
+            )
         self._useless = True
-        text = f"{given} of {asked} frames with a body gave a pose: expected nearly all; what is not used is counted"
-        return self._note([Problem(Level.ERROR, "few_poses", text)])
+        return self._note([found])
 
     def _note(self, found: Iterable[Problem]) -> list[str]:
         new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}

@@ -27,8 +27,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from steadypose.nodes.cli import told_of
-from steadypose.nodes.commands.output import UNTRUSTED, clean_recording
-from steadypose.nodes.driving import NOBODY, Settings
+from steadypose.nodes.commands.output import NO_POSE, UNTRUSTED, clean_recording
+from steadypose.nodes.driving import Settings
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.settings import LaunchError
@@ -160,7 +160,7 @@ def _fault(job: Job, result: Mapping[str, Any]) -> str:
     return {
         CLEAN: "",
         FAILED: str(result.get("error")).removeprefix(f"{job.source}: "),
-        EMPTY: NOBODY,
+        EMPTY: NO_POSE,
         DAMAGED: f"damaged; {damage}",
         DOUBTFUL: UNTRUSTED,
     }[outcome(result)]

@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
 from steadypose.nodes.commands.output import (
+    NO_POSE,
     UNTRUSTED,
     File,
     In,
@@ -20,7 +21,6 @@ from steadypose.nodes.commands.output import (
     console,
     printable,
 )
-from steadypose.nodes.driving import NOBODY
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.settings import LaunchError
@@ -110,10 +110,10 @@ def clean(
         terminal.print(f"  not used as given, {cause}: {count}")
     for problem in done.problems:
         terminal.print(f"  {problem}", style="yellow")
-    if done.poses and not done.trusted:
-        terminal.print(f"  {UNTRUSTED}", style="red")
     if not done.poses:
-        terminal.print(f"  {NOBODY}; `steadypose info {source}` shows what it contains", style="red")
+        terminal.print(f"  {NO_POSE}; `steadypose info {source}` shows what it contains", style="red")
+    elif not done.trusted:
+        terminal.print(f"  {UNTRUSTED}", style="red")
     if done.unread:
         terminal.print(f"  {source} is damaged: the readable part is cleaned", style="red")
-    return 1 if done.unread or not done.poses or not done.trusted else 0
+    return 1 if done.unread or not done.trusted else 0

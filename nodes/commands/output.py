@@ -37,6 +37,7 @@ File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 ARRAY_FILES = (".npz", ".csv")
 """endings of outputs that are one file of arrays"""
 UNTRUSTED = "the output cannot be trusted, because of the problems above"
+NO_POSE = "the output has no pose, because of the problems above"
 OTHER_FORMATS = {
     *(".npy", ".json", ".jsonl", ".txt", ".tsv", ".xlsx", ".pkl", ".pt", ".h5", ".hdf5", ".mat", ".parquet", ".bag"),
     *(".bvh", ".fbx", ".glb", ".gltf", ".c3d", ".trc", ".mp4", ".gif", ".png"),
@@ -166,7 +167,7 @@ class Cleaned:
         frames: of the input.
         duration_s: of the input; steps of its stamps back do not count.
         spent_s: computing time.
-        poses: number of poses in the output; 0 if no body was recognised.
+        poses: number of poses in the output; 0 if no body was recognised, which is then a problem.
         refused: what was refused or dropped, by cause.
         problems: what is wrong with the input, each as it was first found.
         trusted: whether the output can be trusted in spite of them.

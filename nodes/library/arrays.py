@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from steadypose.nodes.driving import NOBODY, OfflineRun, Settings
+from steadypose.nodes.driving import OfflineRun, Settings
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.launch import PIPELINES, check_settings
 from steadypose.nodes.graph.loops import compile_missing
@@ -235,9 +235,8 @@ def clean(
     compile_loops()
     run = OfflineRun(source, checked, timeline)
     arrays = run.arrays()
-    problems = run.diagnosis.texts or ([] if run.poses else [NOBODY])
-    warn(problems)
-    return Poses(arrays, problems, run.refused, timeline.events())
+    warn(run.diagnosis.texts)
+    return Poses(arrays, run.diagnosis.texts, run.refused, timeline.events())
 
 
 @suggesting

@@ -15,7 +15,7 @@ from steadypose.msgs.codec import MAX_BODIES
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.checks.layout import axes_hint, skeleton_hint
-from steadypose.nodes.driving import CHECKED, NOBODY, Diagnosis
+from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
@@ -164,11 +164,7 @@ class Filter:
             return []
         end = replace(self._last, bodies=[], end_of_stream=True)
         poses, self._last = self._poses(self._prior.process(end)), None
-        warn(self._diagnosis.end())
-        if not self._recognised and not self.problems:
-            cause, _, text = NOBODY.partition(": ")
-            self._diagnosis.problems[cause] = text
-            warn([NOBODY])
+        warn(self._diagnosis.end() + self._diagnosis.answer(0, self._recognised))
         return poses
 
     @property

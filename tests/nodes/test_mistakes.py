@@ -45,6 +45,7 @@ def frame_by_frame(joints: np.ndarray, times: np.ndarray) -> None:
     cleaner = steadypose.Filter()
     for frame, t in zip(joints, times - times[0], strict=True):
         cleaner(frame, t)
+    cleaner.flush()
 
 
 REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
@@ -187,7 +188,12 @@ WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: steadypose.clean(j, stamp_ns=np.where(np.arange(FRAMES) < 20, 500, 0) * 10**9 + TICKS),
         "stamps go back by 500.0 s",
     ),
-    "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "no body in any frame"),
+    "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "nobody: no frame has a body"),
+    "nobody, frame by frame": (lambda j: frame_by_frame(np.empty((9, 0, 22, 3)), seconds()[:9]), "^nobody: "),
+    "bodies of two joints": (
+        lambda j: steadypose.clean(np.where(np.arange(22)[:, None] < 2, j, np.nan), fps=30),
+        "nobody_recognised: no body in any frame gave a pose",
+    ),
 }
 
 UNKNOWN_BVH = """HIERARCHY
@@ -352,7 +358,10 @@ def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> N
     (tmp_path / "in").mkdir()
     write_npz(tmp_path / "in" / "empty.npz", np.full((60, 1, 22, 3), np.nan))
     assert main(["clean", str(tmp_path / "in" / "empty.npz"), str(tmp_path / "out.npz")]) == 1
-    assert "nobody_recognised: no body in any frame" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "all_missing: " in told
+    assert "the output has no pose, because of the problems above" in told
+    assert "nobody_recognised" not in told, "that all joints are missing says more"
     for _ in ("the first time", "done already"):
         assert main(["clean", str(tmp_path / "in"), str(tmp_path / "out"), "--jobs", "1"]) == 1
         assert "0 of 1 recordings are clean; 1 without anybody in it" in capsys.readouterr().err
@@ -366,7 +375,7 @@ def test_what_cannot_be_trusted_is_written_and_the_exit_status_is_1(
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 1
     told = capsys.readouterr().err
     assert cause in told
-    assert "the output cannot be trusted" in told or "nobody_recognised" in told
+    assert ("the output cannot be trusted" in told) != ("the output has no pose" in told)
     assert (tmp_path / "out.npz").exists()
 
 

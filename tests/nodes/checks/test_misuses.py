@@ -344,7 +344,7 @@ def test_the_page_has_every_cause() -> None:
     package = Path(__file__).parents[3] / "nodes"
     code = "".join(
         file.read_text()
-        for folder in ("checks", "graph", "sources", "sinks/ros2")
+        for folder in (".", "checks", "graph", "sources", "sinks/ros2")
         for file in (package / folder).glob("*.py")
     )
     causes = set(re.findall(r'(?:error|warning)\(\s*"(\w+)"', code))
