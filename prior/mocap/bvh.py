@@ -8,7 +8,8 @@ differ only by a constant shift of the world, and replaces the OFFSET elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,8 @@ class _Node:
 
 _POSITION = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
 _ROTATION = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
+_WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)")
+"""the words of a line; the name of a joint, which may contain spaces, is one"""
 
 
 @dataclass(frozen=True)
@@ -118,10 +121,11 @@ def read_bvh(text: str) -> Bvh:
         MotionError: it is no BVH file, or its motion does not match its hierarchy.
     """
     head, found, motion = text.partition("MOTION")
+    last = text.rstrip().count("\n") + 1
     if not found:
-        raise MotionError("expected HIERARCHY and MOTION sections, found no MOTION")
-    nodes = _hierarchy(head.split())
-    values, fps = _motion(motion, sum(len(n.channels) for n in nodes))
+        raise MotionError(f"expected HIERARCHY and MOTION sections, found no MOTION up to the end on line {last}")
+    nodes = _hierarchy(head)
+    values, fps = _motion(motion, sum(len(n.channels) for n in nodes), last)
     return Bvh(
         joints=tuple(n.name for n in nodes),
         parents=tuple(n.parent for n in nodes),
@@ -132,10 +136,18 @@ def read_bvh(text: str) -> Bvh:
     )
 
 
-def _hierarchy(tokens: list[str]) -> list[_Node]:
+def _hierarchy(text: str) -> list[_Node]:
     nodes: list[_Node] = []
     open_joints: list[int] = []
-    it = iter(tokens)
+    number = 0
+
+    def words() -> Iterator[str]:
+        nonlocal number
+        for number, line in enumerate(text.splitlines(), 1):  # noqa: B007, for errors
+            for match in _WORDS.finditer(line):
+                yield from filter(None, match.groups())
+
+    it = words()
     try:
         if (first := next(it)) != "HIERARCHY":
             raise MotionError(f"expected HIERARCHY at the start, found '{first}'")
@@ -162,21 +174,20 @@ def _hierarchy(tokens: list[str]) -> list[_Node]:
                 open_joints.pop()
             else:
                 raise MotionError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{token}'")
+        if open_joints or not nodes:
+            raise StopIteration
     except (StopIteration, IndexError) as error:
-        raise MotionError("the hierarchy is cut short or its braces do not match") from error
+        raise MotionError(f"line {number}: the hierarchy is cut short or its braces do not match") from error
     except ValueError as error:
-        if isinstance(error, MotionError):
-            raise
-        raise MotionError(f"a number in the hierarchy cannot be read: {error}") from error
-    if open_joints or not nodes:
-        raise MotionError("the hierarchy is cut short or its braces do not match")
+        what = error if isinstance(error, MotionError) else f"a number in the hierarchy cannot be read: {error}"
+        raise MotionError(f"line {number}: {what}") from error
     return nodes
 
 
-def _motion(text: str, channels: int) -> tuple[NDArray[np.float64], float]:
-    """Return values (T, channels), and frames per second."""
+def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], float]:
+    """Return values (T, channels), and frames per second. ``last`` is the number of the file's last line."""
     words = text.split(maxsplit=5)
-    if len(words) < 5 or words[0] != "Frames:" or words[2:4] != ["Frame", "Time:"]:
+    if [word.lower() for word in words[:1] + words[2:4]] != ["frames:", "frame", "time:"] or len(words) < 5:
         raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
     try:
         frames, seconds = int(words[1]), float(words[4])
@@ -186,5 +197,8 @@ def _motion(text: str, channels: int) -> tuple[NDArray[np.float64], float]:
     if seconds <= 0:
         raise MotionError(f"expected a frame time above zero, found {seconds}")
     if len(values) != frames * channels:
-        raise MotionError(f"expected {frames} frames of {channels} numbers, found {len(values)} numbers")
+        raise MotionError(
+            f"expected {frames} frames of {channels} numbers, found {len(values)} numbers up to the end on line {last}"
+            + "; the file is cut short: export it again" * (len(values) < frames * channels)
+        )
     return values.reshape(frames, channels), 1.0 / seconds

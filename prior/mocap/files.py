@@ -128,7 +128,7 @@ def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str
 
 
 def _bvh(content: bytes, description: Description) -> _Read:
-    bvh = read_bvh(content.decode("utf-8", "replace"))
+    bvh = read_bvh(content.decode("utf-8-sig", "replace"))
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
     positions = bvh.positions(rig.lost_bones)[:, [bvh.joints.index(j) for j in rig.skeleton.joints]]
     return bvh.fps, rig.skeleton, positions * (description.metres or rig.metres), rig.up
@@ -182,7 +182,7 @@ def _array(content: bytes, description: Description) -> _Read:
 
 
 def _trc(content: bytes, description: Description) -> _Read:
-    rows = content.decode("utf-8", "replace").splitlines()
+    rows = content.decode("utf-8-sig", "replace").splitlines()
     if len(rows) < 6 or not rows[0].startswith("PathFileType"):
         raise MotionError("expected a TRC file, which begins with PathFileType and has five lines before its numbers")
     header = dict(zip(rows[1].split("\t"), rows[2].split("\t"), strict=False))

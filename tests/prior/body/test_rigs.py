@@ -293,6 +293,17 @@ def test_up_is_from_ankles_to_head(axis: str, turn: list[int]) -> None:
     assert up_axis(-REST_POSITIONS[None][..., [0, 2, 1]]) == "-y"
 
 
+def test_a_bvh_may_begin_with_a_mark_of_utf_8_and_its_names_contain_spaces() -> None:
+    content = write_bvh(FAMILIES["LAFAN1"].joints(), np.array([0.0, 90.0, 0.0]), 30.0)
+    other = b"\xef\xbb\xbf" + content.replace(b"Frame Time:", b"Frame time:")
+    for name in (b"Leg", b"Foot", b"Arm"):
+        for side in (b"Left", b"Right"):
+            other = other.replace(b"JOINT " + side + name, b"JOINT " + side + b" lower " + name + b"  ")
+    assert other.count(b" lower ") == 6
+    assert read_motion("take.bvh", other).fps == read_motion("take.bvh", content).fps
+    np.testing.assert_array_equal(read_motion("take.bvh", other).positions, read_motion("take.bvh", content).positions)
+
+
 def test_a_description_says_what_a_file_does_not() -> None:
     snake = FAMILIES["LAFAN1"].joints()
     renamed = [replace(j, name=f"b{k}", parent=f"b{[i.name for i in snake].index(j.parent)}" if j.parent else None)
