@@ -96,10 +96,14 @@ def complete_source(
         answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
     refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
     bodies = frames.bodies if isinstance(frames, ArraySource) else ()
-    # of key frames, only the joints are checked, and a pelvis at the origin is what `complete` is for
-    few = raws[: -1 : max(len(raws) // CHECKED, 1)]
-    problems = [f"{p.cause}: {p.text}" for p in check_geometry(few) if p.cause != "root_relative"]
+    problems = [text for text in _problems(raws) if not text.startswith("root_relative")]  # `complete` is for those too
     return CompletedSource(raws, answers, completion, refused, problems, bodies)
+
+
+def _problems(raws: Sequence[PoseRaw]) -> list[str]:
+    """The problems with the joints of a stream that has ended, as texts; its stamps are not checked."""
+    few = raws[: -1 : max(len(raws) // CHECKED, 1)]
+    return [f"{problem.cause}: {problem.text}" for problem in check_geometry(few)]
 
 
 class Fitted(NamedTuple):
@@ -111,6 +115,8 @@ class Fitted(NamedTuple):
     """(T,) stamps of the source's frames, nanoseconds"""
     fits: list[Fit]
     """the fit of each body over the time that it was observed"""
+    problems: list[str]
+    """what is wrong with the source's joints"""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, one row per frame. If exactly one body was fitted, also its bones and the ground."""
@@ -164,8 +170,9 @@ def fit_source(
             f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
             "right, are the units metres? `steadypose info` says what it holds"
         )
-    stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)
-    return Fitted(rewritten(messages, fits), stamps, fits)
+    raws = [message for _, message in messages if isinstance(message, PoseRaw)]
+    stamps = np.array([raw.stamp_ns for raw in raws if not raw.end_of_stream], np.int64)
+    return Fitted(rewritten(messages, fits), stamps, fits, _problems(raws))
 
 
 def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:

@@ -21,7 +21,7 @@ from steadypose.nodes.extras import require_extra
 from steadypose.nodes.offline import fit_source, load_transitions, with_bones
 from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sinks.plot.figure import draw_misfit, save
-from steadypose.nodes.sources.key_points import has_key_points, read_key_points
+from steadypose.nodes.sources.key_points import check_up, has_key_points, read_key_points
 from steadypose.nodes.sources.npz import NpzError, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
@@ -112,7 +112,7 @@ def _fit_poses(
     write_output(out, fitted.arrays, lambda: fitted.messages)
     fits = fitted.fits
     _explain(out, [(fit.seen.id, fit.seen.stamps_ns, fit.misfit, fit.track) for fit in fits], "m")
-    return len(fitted.stamps_ns), [fit.track for fit in fits], [_line(fit) for fit in fits]
+    return len(fitted.stamps_ns), [fit.track for fit in fits], [*map(_line, fits), *fitted.problems]
 
 
 def _line(fit: Fit) -> str:
@@ -142,7 +142,8 @@ def _fit_picture(
     write_output(out, lambda: with_bones(arrays_of_fit(recording, track), track), tuple)
     misfit = track.misfit[0]
     _explain(out, [(0, recording.stamps_ns, misfit, track)], "pixels")
-    return frames, [track], [f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"]
+    off = f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"
+    return frames, [track], [off, *check_up(recording)]
 
 
 def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> list[str]:

@@ -312,6 +312,9 @@ def fit(
         The arrays of `clean`. For a body whose fit failed, they are the output of `clean` with ``anomaly_flag`` set,
         and ``problems`` names the body.
 
+    Warns:
+        InputWarning: a fit failed, or as in `clean`.
+
     Raises:
         ValueError: as in `clean`, or nobody is observed for long enough, or torch is not installed (extra 'train').
     """
@@ -321,6 +324,7 @@ def fit(
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     fitted = fit_source(source, "positions", points, model=load_transitions(weights), delay=delay)
     problems = [f"body {fit.seen.id}: not explained, left as `clean` has it" for fit in fitted.fits if not fit.track]
+    problems += fitted.problems
     warn(problems)
     return Poses(fitted.arrays(), problems)
 

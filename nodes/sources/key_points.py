@@ -22,6 +22,7 @@ from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.skeleton import HIPS, SHOULDERS
 from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
 HIGHEST = 100.0
@@ -32,6 +33,12 @@ LONGEST_GAP_NS = 200_000_000
 
 LONGEST_NS = 24 * 3600 * 10**9
 """Longest duration of a recording, nanoseconds. It prevents a single wrong stamp from creating a grid of years."""
+
+NORMALISED = 2.0
+"""Largest coordinate of key points that are not pixels; those of a normalised image may lie a little outside of it."""
+
+MOSTLY = 0.95
+"""Share of frames with shoulders below hips from which on the image's y axis is probably the other."""
 
 _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
 
@@ -102,6 +109,11 @@ def read_key_points(path: Path) -> KeyPointRecording:
     pixels[sure <= 0] = np.nan
     if not np.isfinite(pixels).any():
         raise NpzError(f"{path}: keypoints: expected somebody, got no key point that is finite and has a confidence")
+    if np.nanmax(np.abs(pixels)) <= NORMALISED:
+        raise NpzError(
+            f"{path}: keypoints: expected pixels, as focal and centre, got {np.nanmin(pixels):.2g} to "
+            f"{np.nanmax(pixels):.2g}, as of a normalised image; multiply x by its width and y by its height"
+        )
     count = int((stamps[-1] - stamps[0]) / FRAME_NS + 1e-3) + 1
     grid = stamps[0] + np.round(np.arange(count) * FRAME_NS).astype(np.int64)
     after = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)
@@ -114,6 +126,19 @@ def read_key_points(path: Path) -> KeyPointRecording:
         None if height is None else height.item(),
         None if points is None else in_sight(np.asarray(points, dtype=np.float64)[nearest]),
     )  # fmt: skip
+
+
+def check_up(recording: KeyPointRecording) -> list[str]:
+    """The problem, if there is one, that somebody's shoulders are below their hips throughout, as text."""
+    shoulders, hips = (recording.pixels[:, joints].mean(axis=1) for joints in (SHOULDERS, HIPS))
+    upwards = (shoulders - hips) @ recording.rotation[2, :2]
+    known = upwards[np.isfinite(upwards)]
+    if not len(known) or (known < 0).mean() < MOSTLY:
+        return []
+    return [
+        "up_axis: shoulders are below hips in the image: unless people do lie or stand on their hands, expected pixels "
+        "whose y grows downwards, or the camera's axis that points up as `up`; subtract y from the image's height"
+    ]
 
 
 def _on_grid(

@@ -9,11 +9,12 @@ import pytest
 from conftest import walked, write_npz
 from tests.helpers.smpl_model import model_arrays
 
+import steadypose
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import PoseClean
 from steadypose.nodes.cli import main
-from steadypose.nodes.sources.key_points import read_key_points
+from steadypose.nodes.sources.key_points import check_up, read_key_points
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.prior.fit import solve
 from steadypose.prior.fit.solve import FitSettings
@@ -164,6 +165,10 @@ def test_what_cannot_be_done_is_said(
         ({"camera_height": -1.0}, "more than 0"),
         ({"camera_height": np.nan}, "more than 0"),
         ({"keypoints": np.full((FRAMES, 22, 2), np.nan)}, "expected somebody"),
+        (
+            {"keypoints": np.full((FRAMES, 22, 2), [-0.2, 1.4])},
+            "expected pixels.*got -0.2 to 1.4.*multiply x by",
+        ),
         ({"fps": 0.0}, "fps"),
         ({"fps": 1e-9}, "fps"),
         ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),
@@ -176,6 +181,42 @@ def test_what_is_wrong_with_key_points_is_said(more: dict, says: str, tmp_path: 
     np.savez(path, **key_points(**more))
     with pytest.raises(NpzError, match=says):
         read_key_points(path)
+
+
+@pytest.mark.parametrize(
+    ("told", "warned"),
+    [
+        (key_points(), False),
+        (key_points(up="y"), True),
+        (key_points(up="z"), False),  # a camera that looks straight up or down
+        (key_points(keypoints=[0.0, 720.0] + [1.0, -1.0] * key_points()["keypoints"]), True),
+        (key_points(keypoints=[0.0, 720.0] + [1.0, -1.0] * key_points()["keypoints"], up="y"), False),
+    ],
+)
+def test_a_picture_upside_down_is_warned_of(told: dict, warned: bool, tmp_path: Path) -> None:
+    np.savez(tmp_path / "keys.npz", **told)
+    problems = check_up(read_key_points(tmp_path / "keys.npz"))
+    assert [text.split(":")[0] for text in problems] == ["up_axis"] * warned
+
+
+def test_who_stands_on_their_hands_for_a_while_is_not_warned_of(tmp_path: Path) -> None:
+    keys = key_points()["keypoints"]
+    for share in (0.9, 1.0):
+        rows = slice(round(share * FRAMES))
+        turned = keys.copy()
+        turned[rows] = [0.0, 720.0] + [1.0, -1.0] * turned[rows]
+        np.savez(tmp_path / "keys.npz", **key_points(keypoints=turned))
+        assert bool(check_up(read_key_points(tmp_path / "keys.npz"))) == (share == 1.0)
+
+
+def test_wrong_axes_are_said(seen: Path, pictured: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr("steadypose.nodes.commands.fit.check_up", lambda recording: ["up_axis: in the image"])
+    write_npz(tmp_path / "lying.npz", POSITIONS[..., [1, 2, 0]])
+    for source, said in (("lying.npz", "up_axis: bodies lie"), ("keys.npz", "up_axis: in the image")):
+        assert main(["fit", str(tmp_path / source), str(tmp_path / f"out-{source}")]) == 0
+        assert said in capsys.readouterr().err
+    with pytest.warns(steadypose.InputWarning, match="up_axis"):
+        assert "up_axis" in steadypose.fit(POSITIONS[..., [1, 2, 0]], fps=30).problems[0]
 
 
 def test_key_points_are_put_on_the_grid(tmp_path: Path) -> None:
