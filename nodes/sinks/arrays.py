@@ -24,7 +24,7 @@ from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.timeline import TimedEvent
 
 SLACK_NS = 1_000_000
-"""Tolerance added to the frame period over which a grid row's values are held, nanoseconds."""
+"""Time short of a period for which a row is held, nanoseconds: a period away, where there is a body, is another row."""
 
 _ROW = np.dtype(
     [
@@ -100,7 +100,8 @@ def _blank(shape: tuple[int, ...]) -> NDArray[np.void]:
 
 
 def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void]:
-    """One body's rows at other stamps: interpolated between neighbours of the grid, held for one period at its ends."""
+    """One body's rows at other stamps: interpolated between neighbours of the grid, held for less than a period at
+    its ends."""
     grid = grid[np.unique(grid["stamp_ns"], return_index=True)[1]]
     after = np.searchsorted(grid["stamp_ns"], stamps_ns, side="right").clip(1, max(len(grid) - 1, 1))
     before, after = after - 1, np.minimum(after, len(grid) - 1)
@@ -110,7 +111,7 @@ def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void
     nearest = np.where(np.abs(stamps_ns - first) <= np.abs(last - stamps_ns), before, after)
     # in a gap of the grid, and at its ends, there is at most one neighbour
     between = (span <= 1.5 * FRAME_NS) & (fraction >= 0) & (fraction <= 1)
-    known = between | (np.abs(grid["stamp_ns"][nearest] - stamps_ns) <= FRAME_NS + SLACK_NS)
+    known = between | (np.abs(grid["stamp_ns"][nearest] - stamps_ns) < FRAME_NS - SLACK_NS)
     before, after = np.where(between, before, nearest), np.where(between, after, nearest)
     fraction = np.where(between, fraction, 0.0)
 

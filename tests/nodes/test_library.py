@@ -77,6 +77,19 @@ def test_frames_to_complete_may_come_in_any_order_and_lying_bodies_are_warned_of
         assert steadypose.complete(seen[..., [1, 2, 0]], stamp_ns=stamps).problems
 
 
+@pytest.mark.parametrize("function", [steadypose.clean, steadypose.complete])
+def test_the_frame_before_somebody_enters_has_nothing_of_them(function: Any) -> None:
+    """Nor has the frame after they left, of a completion, which has no delay."""
+    both = np.stack([WALK, WALK + [2.0, 0.0, 0.0]], axis=1)
+    both[:5, 1] = both[20:, 0] = np.nan
+    poses = function(both, fps=30)
+    assert not poses.state[:5, 1].any()
+    assert np.isnan(poses.positions[:5, 1]).all()
+    assert poses.state[5:, 1].all()
+    assert poses.state[:20, 0].all()
+    assert function is steadypose.clean or not poses.state[20:, 0].any()
+
+
 def test_a_mask_of_what_was_seen_is_a_confidence() -> None:
     joints = walked(20)
     seen = np.ones((20, 22), bool)
