@@ -18,7 +18,6 @@ STUDIES: dict[str, str] = {
     "counter": "simulated people behind a counter: heading, place, height, sitting or standing",
     "contacts": "load of feet, against force plates",
     "humor": "futures, noisy and hidden joints, a simulated detector and depth camera (the HuMoR paper)",
-    "humor_credit": "what a fit owes to HuMoR's transition model and contacts",
     "event_mocap": "events of motion capture whose names say what it holds",
     "ablations": "what each part of the default is worth, and its milliseconds",
 }
