@@ -44,7 +44,6 @@ _PARTS = {
 """Top-level names of each model's state dict, used to detect a file of another model."""
 
 _OPTIONAL_PARTS = {"hgvae": {"completion"}, "humor": {"prior"}}
-_OTHER_SIZES = {"hmvae64": "hmvae", "hgvae-wide": "hgvae"}
 
 
 class WeightsError(ValueError):
@@ -108,7 +107,7 @@ def load_weights(name: str, model: str) -> tuple[Arrays, dict[str, Any]]:
 
 def _check_parts(path: Path, model: str, arrays: Arrays) -> None:
     """Refuse weights of another model: HG-VAE's fault network lies beside it as ``.faults.safetensors``."""
-    kind = "faults" if ".faults" in path.suffixes else _OTHER_SIZES.get(model, model)
+    kind = "faults" if ".faults" in path.suffixes else {"hmvae64": "hmvae"}.get(model, model)
     found = {key.partition(".")[0] for key in arrays}
     expected = set(_PARTS[kind].split())
     if expected <= found <= expected | _OPTIONAL_PARTS.get(kind, set()):

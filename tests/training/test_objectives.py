@@ -146,7 +146,7 @@ def test_hgvaes_kl_is_of_posterior_from_prior_at_every_level() -> None:
 
 
 def test_hgvaes_kl_counts_in_full_after_a_fifth_of_the_training(motion: MotionSet) -> None:
-    recipe = hgvae.recipe_of("hgvae", Windows(motion), Windows(motion), 8, 1e-3)
+    recipe = hgvae.recipe_of(Windows(motion), Windows(motion), 1e-3)
     loss = partial(recipe.loss, small_hgvae())
     nats = value(loss, 0.0)[1]["KL"] / 2
     start = value(loss, 0.0)[0] - 0.001 * nats

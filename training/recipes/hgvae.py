@@ -38,7 +38,7 @@ from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
 
 ITERATIONS, COMPLETION_BATCH = 9_000, 128
-"""Number of steps of the live model; windows per step of its completion network."""
+"""Number of steps; windows per step of the completion network."""
 
 FAULTS = (stands_still, exchanged, displaced)
 FAULT_SHARE = 0.3
@@ -117,21 +117,16 @@ def _rms_mm(off: Tensor) -> float:
     return off.square().mean().sqrt().item() * SCALE * 1000
 
 
-MODELS: dict[str, HGVAEConfig] = {
-    "hgvae": HGVAEConfig(
-        coefficients=20,
-        features=48,
-        levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 12)),
-        completion=CompletionConfig(),
-    ),
-    "hgvae-wide": HGVAEConfig(
-        coefficients=50,
-        features=256,
-        levels=(Level(1, 256), Level(8, 128), Level(24, 128), Level(JOINT_NODES, 128)),
-        completion=CompletionConfig(),
-    ),
-}
-"""Sizes of the models: ``hgvae`` runs live on a robot's CPU; ``hgvae-wide`` has the paper's size, for recordings."""
+CONFIG = HGVAEConfig(
+    coefficients=20,
+    features=48,
+    levels=(Level(1, 48), Level(8, 24), Level(24, 24), Level(JOINT_NODES, 12)),
+    completion=CompletionConfig(),
+)
+"""Sizes with which it runs live on a robot's CPU; the paper's are about five times as wide."""
+
+BATCH, RATE = 64, 6e-3
+"""Windows per step, and initial learning rate."""
 
 KL_START = 0.001
 """Initial beta (section 5)."""
@@ -149,40 +144,31 @@ def train_hgvae(options: TrainingOptions) -> Path:
     Returns:
         The path of the weights.
     """
-    return _train("hgvae", options, ITERATIONS, batch=64, rate=6e-3)
-
-
-def train_hgvae_wide(options: TrainingOptions) -> Path:
-    """Train the paper's size: fewer and smaller steps, so that it stays within an hour on two cores."""
-    return _train("hgvae-wide", options, 4_000, batch=32, rate=5e-4)
-
-
-def _train(model: str, options: TrainingOptions, iterations: int, batch: int, rate: float) -> Path:
-    weights, seed, start, path = options.weights, options.seed, options.start, options.path(model)
-    iterations = options.iterations or iterations
+    weights, seed, start, path = options.weights, options.seed, options.start, options.path("hgvae")
+    iterations = options.iterations or ITERATIONS
     train, val = (Windows(motion) for motion in options.motion())
     torch.manual_seed(seed)
-    network = HGVAE(MODELS[model])
+    network = HGVAE(CONFIG)
     network.mean.copy_(mean_tracks(train, network.config.frames))
-    origin = started(network, model, start)
+    origin = started(network, "hgvae", start)
     completion = completion_recipe(network, train, val)
     completion.minimise(_network(network), options.runs / f"{path.stem}-completion", iterations, seed)
-    recipe = recipe_of(model, train, val, batch, rate if start is None else rate / 2)
+    recipe = recipe_of(train, val, RATE if start is None else RATE / 2)
     run = recipe.minimise(network, path.parent, iterations, seed)
     run.save(path, network, asdict(network.config), {
-        "Model": f"HG-VAE, '{model}' of training/recipes/hgvae.py",
+        "Model": "HG-VAE, of training/recipes/hgvae.py",
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
-        "Training": f"`steadypose train {model} --weights {weights}`: {iterations} steps of {batch} windows, "
+        "Training": f"`steadypose train hgvae --weights {weights}`: {iterations} steps of {BATCH} windows, "
         f"after as many of {completion.batch} for its completion network, "
         f"AdamW {recipe.rate:g}, seed {seed}{origin}",
     })  # fmt: skip
-    faults = None if start is None else str(weights_path(start, model).with_suffix(".faults.safetensors"))
+    faults = None if start is None else str(weights_path(start, "hgvae").with_suffix(".faults.safetensors"))
     train_anomaly(path, -(-iterations // 3), replace(options, start=faults))
     return path
 
 
-def recipe_of(name: str, train: Windows, val: Windows, batch: int, rate: float) -> Recipe[HGVAE]:
+def recipe_of(train: Windows, val: Windows, rate: float) -> Recipe[HGVAE]:
     """Of all of a model but its completion network, with the loss of the module's docstring."""
 
     def loss_of(model: HGVAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
@@ -205,8 +191,8 @@ def recipe_of(name: str, train: Windows, val: Windows, batch: int, rate: float) 
         return loss, {"loss": loss.item(), "KL": 2 * kl.item()}
 
     return Recipe(
-        name, lambda: HGVAE(MODELS[name]), loss_of, lambda model: evaluate_hgvae(model, val), ITERATIONS, batch, rate,
-        schedule=CosineAnnealingLR, evaluations=24, clip=CLIP_ENTRY * math.sqrt(MODELS[name].frames * JOINT_NODES),
+        "hgvae", lambda: HGVAE(CONFIG), loss_of, lambda model: evaluate_hgvae(model, val), ITERATIONS, BATCH, rate,
+        schedule=CosineAnnealingLR, evaluations=24, clip=CLIP_ENTRY * math.sqrt(CONFIG.frames * JOINT_NODES),
         parameters=lambda model: [p for name, p in model.named_parameters() if not name.startswith("completion.")],
     )  # fmt: skip
 

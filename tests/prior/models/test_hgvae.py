@@ -169,7 +169,7 @@ def test_the_live_model_is_the_trained_one_and_a_window_does_not_depend_on_the_o
 def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
     config = replace(SMALL, frames=20)
-    monkeypatch.setattr("steadypose.training.recipes.hgvae.MODELS", {"hgvae": config})
+    monkeypatch.setattr("steadypose.training.recipes.hgvae.CONFIG", config)
     monkeypatch.setattr("steadypose.training.recipes.hgvae_faults.WINDOWS", 16)
     path = train_hgvae(TrainingOptions(prepared(tmp_path / "m.npz"), tmp_path / "runs", iterations=2))
     state, stored = load_tensors(str(path), "hgvae")
