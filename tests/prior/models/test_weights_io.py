@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from steadypose.prior.models.weights import _OTHER_SIZES, _PARTS, WEIGHTS, WeightsError, load_weights
+from steadypose.prior.models.weights import _PARTS, WEIGHTS, WeightsError, load_weights
 
 
 def model_of(path: Path) -> str:
-    return "faults" if ".faults" in path.suffixes else path.stem.partition("-")[0]
+    return "faults" if ".faults" in path.suffixes else path.stem.partition("-")[0].removesuffix("64")
 
 
 @pytest.mark.parametrize("path", sorted(WEIGHTS.glob("*.safetensors")), ids=lambda path: path.stem)
@@ -22,7 +22,7 @@ def test_weights_that_ship_are_those_of_one_model_alone(path: Path, tmp_path: Pa
     assert all(array.dtype == np.float32 for array in arrays.values())
     copy = tmp_path / f"{path.name.partition('.')[0]}.safetensors"
     copy.write_bytes(path.read_bytes())
-    for other in set(_PARTS) - {"faults", _OTHER_SIZES.get(model_of(path), model_of(path))}:
+    for other in set(_PARTS) - {"faults", model_of(path)}:
         with pytest.raises(WeightsError, match=f"expected weights of {other}"):
             load_weights(str(copy), other)
 
