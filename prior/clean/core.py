@@ -174,8 +174,9 @@ class CleanCore:
     def _fused(self, smoothed: Smoothed, newest: _Newest, back: int) -> CleanFrame:
         """Return the output for the frame ``back`` frames before the newest."""
         at, imputed = -1 - back, newest.imputed
+        sigma = np.hypot(smoothed.sigma, newest.gated.observation.layout_sigma)
         estimate = self.fuse.fuse(
-            smoothed,
+            smoothed._replace(sigma=sigma),
             newest.person,
             newest.bias,
             newest.rotations[at],

@@ -40,6 +40,7 @@ class Observation:
         confidence: (S, 22) in 0..1.
         present: (S,) which slots hold a body that was observed in this frame or within the timeout.
         sensor_position: (3,) metres, position of the sensor.
+        layout_sigma: (S, 22) metres along an axis, error of the joints that a layout interpolates.
     """
 
     stamp_s: float
@@ -47,6 +48,7 @@ class Observation:
     confidence: Floats
     present: Bools
     sensor_position: Floats
+    layout_sigma: Floats
 
 
 @dataclass(frozen=True)

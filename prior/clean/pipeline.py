@@ -58,6 +58,7 @@ class BodyPipeline(ABC, Generic[Key]):
         self._timeout_ns = round(settings.timeout * 1e9)
         self._core = CleanCore(settings, self.counters)
         self._slots: Slots[Key] = Slots(settings.max_bodies, settings.timeout, self.counters)
+        self._layout_sigma = np.zeros((settings.max_bodies, 22))
         self._origin_ns = 0  # stages count seconds from here, because float seconds since 1970 would be rounded
 
     @property
@@ -94,7 +95,9 @@ class BodyPipeline(ABC, Generic[Key]):
         keyed = list(zip(keys, bodies.values(), strict=True))
         if (out := self._slots.crowded_out(self.most_bodies, keyed, sensor.origin)).any():
             self._drop(out)
-        return self._slots.arrange(keyed)
+        joints = self._slots.arrange(keyed)
+        self._layout_sigma[np.isfinite(joints.positions).any(axis=(1, 2))] = layout.sigma
+        return joints
 
     def _advance_to(self, stamp_ns: int, joints: BodyJoints, sensor_position: Floats) -> CleanFrame | None:
         """Process one step of the 30 Hz grid."""
@@ -108,6 +111,7 @@ class BodyPipeline(ABC, Generic[Key]):
                 confidence=joints.confidence,
                 present=self._slots.present,
                 sensor_position=sensor_position,
+                layout_sigma=self._layout_sigma.copy(),
             )
         )
 

@@ -32,6 +32,7 @@ def observation(positions: np.ndarray, stamp_s: float = 0.0, confidence: np.ndar
         confidence=np.ones(positions.shape[:2]) if confidence is None else confidence,
         present=np.ones(len(positions), dtype=bool),
         sensor_position=np.zeros(3),
+        layout_sigma=np.zeros(positions.shape[:2]),
     )
 
 

@@ -207,7 +207,7 @@ def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, spli
         for t, (frame, confidence) in enumerate(zip(seen, sensed.confidence.swapaxes(0, 1), strict=True)):
             recorder.frame = t - delay
             confidence = np.where(np.isfinite(frame[..., 0]), confidence, 0.0)
-            core.step(Observation(t / FPS, frame, confidence, present, np.zeros(3)))
+            core.step(Observation(t / FPS, frame, confidence, present, np.zeros(3), np.zeros((CLIPS, 22))))
         at = np.concatenate([np.full(len(rows.joint), frame) for frame, rows in recorder.rows])
         body, joint, candidates, features = (
             np.concatenate(parts) for parts in zip(*(rows for _, rows in recorder.rows), strict=True)

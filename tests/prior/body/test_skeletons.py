@@ -76,6 +76,13 @@ def test_pelvis_and_neck_of_a_mean_person_lie_above_hips_and_shoulders(name: str
         assert np.linalg.norm(mapped[J["neck"]] - REST_POSITIONS[J["neck"]]) < 0.015
 
 
+def test_only_joints_interpolated_between_unlike_ones_have_an_error_of_their_own() -> None:
+    errs = {name: {JOINTS[j] for j in np.flatnonzero(layout.sigma)} for name, layout in SKELETONS.items()}
+    assert errs["coco17"] == errs["blazepose33"] == {"pelvis", "neck"}
+    assert errs["h36m17"] == errs["halpe26"] == {"pelvis"}, "their necks are measured"
+    assert errs["smpl22"] == errs["kinect22"] == set(), "the mean of a joint and a joint is none"
+
+
 def test_canonical_maps_to_itself() -> None:
     positions = np.random.default_rng(1).normal(size=(22, 3))
     assert np.allclose(to_canonical(CANONICAL, positions)[0], positions)

@@ -7,15 +7,14 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import PERIOD_NS, noisy, raw, stream, waving
-from tests.helpers.values import clean
+from tests.helpers.values import clean, observation
 
 from steadypose.msgs.codec import encode
 from steadypose.msgs.types import JointState, Pose, PoseClean
 from steadypose.prior.body.kinematics import forward_kinematics, yaw_matrix
-from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.layouts import INTERPOLATED_SIGMA, SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.clean import core
-from steadypose.prior.clean.frame import Observation
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.rate import FPS
@@ -184,6 +183,9 @@ def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_completed() -> No
     assert state[J["left_foot"]] == JointState.IMPUTED
     assert state[J["left_elbow"]] == JointState.REFINED
     assert np.linalg.norm(positions(cleaned)[15] - truth[15], axis=-1)[J["left_wrist"]] < 0.05
+    sigma = cleaned[15].bodies[0].sigma
+    assert sigma[[0, J["neck"]]].min() > 0.5 * INTERPOLATED_SIGMA, "they lie only about between hips and shoulders"
+    assert sigma[J["left_hip"]] < 0.1 * INTERPOLATED_SIGMA
 
 
 def test_bodies_do_not_disturb_each_other() -> None:
@@ -344,7 +346,7 @@ def test_a_body_does_not_inherit_how_long_the_one_before_in_its_slot_went_unpubl
     for t, positions in enumerate(waving(2 * half)):
         if t == half:
             stages.forget(everybody)
-        frame = stages.step(Observation(t / FPS, positions[None], np.ones((1, 22)), everybody, np.zeros(3)))
+        frame = stages.step(observation(positions[None], t / FPS))
         assert frame is not None
         stages.note_published(frame, published=())
     assert counters["body_begun_anew"] == 0

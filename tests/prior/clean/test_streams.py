@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import raw, waving
 
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw
+from steadypose.prior.body.layouts import COCO17
+from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.batch import PATIENCE_NS, StreamBatch
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
@@ -70,6 +72,18 @@ def alone(arrivals: list[Arrival], **settings) -> list[PoseClean]:
     return [clean for _, message in arrivals for clean in pipeline.process(message)]
 
 
+def test_each_stream_has_the_deviations_of_its_own_layout() -> None:
+    coco, canonical = kiosk("coco", 20), kiosk("canonical", 20)
+    for _, message in coco:
+        message.skeleton = "coco17"
+        body = message.bodies[0]
+        body.positions = body.positions[COCO17.to_canonical.argmax(axis=0)]
+        body.confidence = body.confidence[:17]
+    answers, _ = serve(coco, canonical)
+    interpolated, measured = (answers[name][12].bodies[0].sigma[[0, J["neck"]]] for name in ("coco", "canonical"))
+    assert interpolated.min() > 0.015 > measured.max()
+
+
 @pytest.mark.parametrize("identify", [False, True])
 def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
     settings = {"identify": {"enabled": identify, "birth": 0.1}}
@@ -98,7 +112,7 @@ def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
             by_id = {b.id: b for b in wanted.bodies}
             for body in got.bodies:
                 np.testing.assert_allclose(body.positions, by_id[body.id].positions, atol=near)
-                np.testing.assert_allclose(body.raw_positions, by_id[body.id].raw_positions, atol=2e-4)
+                np.testing.assert_allclose(body.raw_positions, by_id[body.id].raw_positions, atol=2e-3)
                 turn = Rotation.from_quat(body.rotations) * Rotation.from_quat(by_id[body.id].rotations).inv()
                 assert turn.magnitude().max() < turned
 
