@@ -19,7 +19,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import NEEDED, Skeleton, middles
-from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.body.skeleton import COLLAR_SHARES, HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
 Mixture = Mapping[str, float]
 
@@ -221,7 +221,7 @@ def _weights(source: str | Mixture) -> Mixture:
 
 def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) -> Mixture:
     """Return the rest skeleton's collar as a mixture of its neighbours."""
-    return mix((spine3, 0.333), (neck, 0.278), (shoulder, 0.389))
+    return mix(*zip((spine3, neck, shoulder), COLLAR_SHARES, strict=True))
 
 
 def recognise_points(names: Sequence[str]) -> Skeleton:

@@ -16,6 +16,7 @@ from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import impute
+from steadypose.prior.clean.mixtures import mix
 from steadypose.prior.clean.occluded import Track
 from steadypose.prior.clean.posture import Posture
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
@@ -190,6 +191,9 @@ class CleanCore:
             noise = np.hypot(newest.gated.jitter, newest.bias.bias_sigma)
             estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
+        mixed = mix(estimate, self._history.unseen_s[at])
         if self._orient:
-            estimate = self._orient.update(estimate)
+            oriented = self._orient.update(replace(mixed, sigma=estimate.sigma))
+            mixed = replace(mixed, rotations=oriented.rotations)
+        estimate = mixed
         return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])

@@ -188,6 +188,19 @@ def test_what_a_sensor_lacks_is_held_between_its_neighbours_or_completed() -> No
     assert sigma[J["left_hip"]] < 0.1 * INTERPOLATED_SIGMA
 
 
+def test_collars_that_a_sensor_lacks_are_where_they_are_in_all_motion() -> None:
+    truth = waving(20)
+    for side in ("left", "right"):
+        collar = 0.333 * truth[:, J["spine3"]] + 0.278 * truth[:, J["neck"]] + 0.389 * truth[:, J[f"{side}_shoulder"]]
+        truth[:, J[f"{side}_collar"]] = collar
+    kinect = np.einsum("ij,tjk->tik", np.linalg.pinv(SKELETONS["kinect22"].to_canonical), truth)
+    body = clean(stream(kinect, skeleton="kinect22"))[0][15].bodies[0]
+    collars = [J["left_collar"], J["right_collar"]]
+    assert np.abs(body.positions[collars] - truth[15, collars]).max() < 0.002
+    assert body.sigma[collars].max() < 0.005
+    assert (body.state[collars] == JointState.IMPUTED).all()
+
+
 def test_bodies_do_not_disturb_each_other() -> None:
     a, b = noisy(20, 0.02), noisy(20, 0.02) + [2.0, 0, 0]
     together = [raw(10**18 + k * PERIOD_NS, {1: a[k], 2: b[k]}) for k in range(20)]
