@@ -13,6 +13,7 @@ import tyro
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.commands.batch import FILES, find_recordings, is_folder_of_recordings
 from steadypose.nodes.commands.output import check_output, plural
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import LaunchError
@@ -28,7 +29,6 @@ from steadypose.prior.timing.rate import FPS
 if TYPE_CHECKING:
     from steadypose.training.recipes.sensor_bias import HeldOut, SensorTake
 
-ENDINGS = (".npz", ".csv", ".mcap")
 SHORTEST_S = 10.0
 """Time in seconds that sensor and reference have in common, at least, in all recordings together."""
 
@@ -143,15 +143,25 @@ def _pairs(recording: Path, reference: Path) -> list[tuple[Path, Path]]:
     for path in (recording, reference):
         if not path.exists():
             raise LaunchError(f"{path} does not exist: expected a recording, an .npz or .csv, or a folder of these")
-    if recording.is_file() or (recording / "metadata.yaml").exists():
+    if not is_folder_of_recordings(recording):
         return [(recording, reference)]
-    files = sorted(path for path in recording.rglob("*") if path.suffix in ENDINGS)
-    pairs = [(path, reference / path.relative_to(recording)) for path in files]
-    alone = [str(path) for path, other in pairs if not other.exists()]
+    # by name alone: sensor and reference are rarely recorded by the same program
+    others = {_name(path, reference): path for path in find_recordings(reference)} if reference.is_dir() else {}
+    found = [(path, others.get(_name(path, recording))) for path in find_recordings(recording)]
+    pairs = [(path, other) for path, other in found if other]
+    alone = [str(path) for path, other in found if not other]
     if not pairs or alone:
         what = f"of {', '.join(alone[:4])} there is none" if alone else f"{recording} holds none"
-        raise LaunchError(f"{reference}: expected a reference for each recording ({', '.join(ENDINGS)}): {what}")
+        raise LaunchError(
+            f"{reference}: expected a reference of the same name for each recording (rosbag2 directory, .mcap or "
+            f"{', '.join(FILES)}): {what}"
+        )
     return pairs
+
+
+def _name(path: Path, root: Path) -> Path:
+    """Of a recording in a folder: where it lies there, without the ending of a file."""
+    return path.relative_to(root) if path.is_dir() else path.relative_to(root).with_suffix("")
 
 
 def _person(path: Path, root: Path) -> str:

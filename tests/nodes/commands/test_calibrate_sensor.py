@@ -85,3 +85,16 @@ def test_a_recording_without_its_reference_is_named(tmp_path: Path, capsys) -> N
     folders = [str(tmp_path / name) for name in ("sensor", "reference")]
     assert main(["calibrate", "sensor", *folders, "--out", str(tmp_path)]) == USAGE_ERROR
     assert "ann/a.npz there is none" in capsys.readouterr().err
+
+
+def test_recordings_go_with_files_of_their_name_and_a_person_is_the_folder_above(tmp_path: Path, capsys) -> None:
+    for seed, take in enumerate(("walk", "sit")):
+        sensor, reference = write(tmp_path, f"ann/{take}", 1.0, seed)
+        reference.rename(reference.parents[1] / f"{take}.npz")
+        assert main(["clean", str(sensor), str(sensor.parents[1] / f"{take}_")]) == 0
+        sensor.unlink()
+        sensor.parent.rmdir()
+        (sensor.parents[1] / f"{take}_").rename(sensor.parent)
+    folders = [str(tmp_path / name) for name in ("sensor", "reference")]
+    assert main(["calibrate", "sensor", *folders, "--iterations", "1", "--out", str(tmp_path)]) == 0
+    assert "2 recordings of 1 person" in capsys.readouterr().out
