@@ -20,7 +20,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.kinematics import rotation_matrix
+from steadypose.prior.body.kinematics import rigid_alignment, rotation_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.stream import interpolated
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 SHORTEST_S = 10.0
 """Time in seconds that sensor and reference have in common, at least, in all recordings together."""
+FARTHEST_M, SHIFTS = 0.25, range(-15, 16)
+"""Largest mean distance of a sensor's joints from the reference's, once aligned, metres; shifts in time that are tried,
+in ticks of 30 Hz."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +137,38 @@ def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
             )
         ticks = np.arange(first, last, 1e9 / FPS).astype(np.int64)
         common_s += (last - first) * 1e-9
-        yield SensorTake(_person(observed_at, recording), _at(observed, ticks), observed.camera, _at(truth, ticks))
+        take = SensorTake(_person(observed_at, recording), _at(observed, ticks), observed.camera, _at(truth, ticks))
+        _check_match(take, f"{observed_at} and {truth_at}")
+        yield take
     if common_s < SHORTEST_S:
         raise LaunchError(f"{recording}: expected {SHORTEST_S:g} s or more beside {reference}, got {common_s:.1f}")
+
+
+def _check_match(take: SensorTake, files: str) -> None:
+    """Raise if sensor and reference differ by more than a sensor's error: it would be learned as if it were that."""
+    off = {shift: _mean_distance(take, shift) for shift in SHIFTS}
+    best = min(off, key=lambda shift: off[shift])
+    if abs(best) > 1 and off[best] < 0.7 * off[0]:
+        raise LaunchError(
+            f"{files}: expected stamps of one clock, but the reference fits best {abs(best) / FPS:.2f} s "
+            f"{'earlier' if best > 0 else 'later'} ({1e3 * off[best]:.0f} mm off instead of {1e3 * off[0]:.0f}); "
+            "correct the stamps of one of them"
+        )
+    if not off[0] < FARTHEST_M:
+        raise LaunchError(
+            f"{files}: expected one person's joints within {FARTHEST_M:g} m on average, aligned, got {off[0]:.2f} m; "
+            "are both in metres and right-handed, in the order of their skeleton, and of the same moment?"
+        )
+
+
+def _mean_distance(take: SensorTake, shift: int) -> float:
+    """Metres between joints, aligned, with the reference ``shift`` ticks earlier; infinite if none is in both."""
+    frames = len(take.truth) - abs(shift)
+    truth, observed = take.truth[max(shift, 0) :][:frames], take.observed[max(-shift, 0) :][:frames]
+    if (finite_joints(truth) & finite_joints(observed)).sum() < 3:
+        return np.inf
+    rotation, translation = rigid_alignment(truth, observed)
+    return float(np.nanmean(np.linalg.norm(truth @ rotation.T + translation - observed, axis=-1)))
 
 
 def _pairs(recording: Path, reference: Path) -> list[tuple[Path, Path]]:

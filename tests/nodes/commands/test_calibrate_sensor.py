@@ -69,6 +69,9 @@ def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> 
         ({"positions": np.full((FRAMES, 22, 3), np.nan)}, "expected a person in two frames or more"),
         ({"positions": np.ones((FRAMES, 2, 22, 3))}, "expected one person, got 2"),
         ({"positions": waving(100), "stamp_ns": 10**18 + np.arange(100) * 33_333_333}, "expected 10 s or more"),
+        ({"positions": 1000 * waving(FRAMES)}, "are both in metres"),
+        ({"positions": waving(FRAMES)[:, ::-1]}, "in the order of their skeleton"),
+        ({"stamp_ns": 10**18 + (np.arange(FRAMES) + 12) * 33_333_333}, "the reference fits best 0.40 s earlier"),
     ],
 )
 def test_recordings_that_do_not_go_together_are_refused(change: dict, answer: str, tmp_path: Path, capsys) -> None:
@@ -77,6 +80,14 @@ def test_recordings_that_do_not_go_together_are_refused(change: dict, answer: st
     np.savez(reference, **(good | change))
     assert main(["calibrate", "sensor", str(sensor), str(reference), "--out", str(tmp_path)]) == USAGE_ERROR
     assert answer in capsys.readouterr().err
+
+
+def test_a_reference_with_none_of_the_sensors_joints_is_refused(tmp_path: Path, capsys) -> None:
+    sensor, reference = write(tmp_path, "ann", 1.0, 0)
+    for path, seen in ((sensor, np.arange(22) < 20), (reference, np.arange(22) >= 20)):
+        np.savez(path, positions=np.where(seen[:, None], waving(FRAMES), np.nan), skeleton="smpl22", fps=30.0)
+    assert main(["calibrate", "sensor", str(sensor), str(reference), "--out", str(tmp_path)]) == USAGE_ERROR
+    assert "got inf m" in capsys.readouterr().err
 
 
 def test_a_recording_without_its_reference_is_named(tmp_path: Path, capsys) -> None:
