@@ -93,6 +93,16 @@ def _sensor_pose(raw: PoseRaw) -> Iterator[Problem]:
             f"{np.round(pose.orientation, 3).tolist()} of norm {norm:.3g}; expected finite numbers and a unit "
             "quaternion xyzw: Pose.from_up('-y') for a level camera, 0 0 0 1 if z is up",
         )
+        return
+    from steadypose.prior.clean.adapt import MAX_PLACE  # imported late: loads 95 MB of numba
+
+    if not (farthest := float(np.abs(pose.position).max())) < MAX_PLACE:
+        yield error(
+            "sensor_pose",
+            f"sensor_pose.position is {farthest:.0f} m from the world's origin along an axis: expected less than "
+            f"{MAX_PLACE:.0f}, or rounding would move joints by millimetres; subtract an origin near the people, or "
+            "use a frame such as odom",
+        )
 
 
 def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:

@@ -143,6 +143,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "a clock that is ahead": (stamp(lambda ns, _: ns + 5 * SECOND_NS), "stamps_ahead", "NTP or PTP"),
     "a clock that is set": (WALL_CLOCK_SET, "clock_jumped", "slew that clock"),
     "a sensor pose of zeros": (posed([0, 0, 0], [0, 0, 0, 0]), "sensor_pose", "unit quaternion xyzw"),
+    "a sensor pose in UTM": (posed([691_000, 5_334_000, 520], [0, 0, 0, 1], True), "sensor_pose", "subtract an origin"),
     "a quaternion wxyz": (posed([0, 0, 0], [1.0, 0, 0, 0]), "quaternion_order", "expected xyzw, 0 0 0 1"),
     "y up, and z said": (axes(1, 2, 0), "up_axis", "Pose.from_up('y')"),
     "an optical frame, and z said": (OPTICAL, "up_axis", "Pose.from_up('-y')"),
