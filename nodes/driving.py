@@ -68,7 +68,9 @@ class Diagnosis:
 
     def __init__(self, settings: PriorSettings) -> None:
         self.problems: dict[str, str] = {}
-        self._check = StreamCheck(settings.max_bodies, identified=settings.identify.enabled)
+        self._check = StreamCheck(
+            settings.max_bodies, identified=settings.identify.enabled, min_confidence=settings.gate.min_confidence
+        )
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
         self._last_ns = self._span_ns = self._back_ns = 0

@@ -21,12 +21,15 @@ ENOUGH = 5
 """Smallest number of messages to judge by."""
 
 
-def check_layout(messages: Sequence[PoseRaw], max_bodies: int, *, identified: bool) -> Iterator[Problem]:
+def check_layout(
+    messages: Sequence[PoseRaw], max_bodies: int, min_confidence: float, *, identified: bool
+) -> Iterator[Problem]:
     """Problems with the layout, sensor pose, confidences and ids in a window of messages.
 
     Args:
         messages: the window.
         max_bodies: largest number of bodies that the prior tracks at once.
+        min_confidence: confidence below which the prior takes a joint as unobserved.
         identified: whether the prior assigns ids itself and ignores the source's.
     """
     if len(messages) < ENOUGH:
@@ -42,7 +45,7 @@ def check_layout(messages: Sequence[PoseRaw], max_bodies: int, *, identified: bo
         yield _wrong_count(messages, skeleton, common)
         return
     few = some_bodies(messages)
-    yield from _confidence(few)
+    yield from _confidence(few, min_confidence)
     yield from _seen(few)
     yield from _ids(messages, max_bodies, identified)
 
@@ -105,7 +108,7 @@ def _sensor_pose(raw: PoseRaw) -> Iterator[Problem]:
         )
 
 
-def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+def _confidence(messages: Sequence[PoseRaw], needed: float) -> Iterator[Problem]:
     found = [body.confidence for body in bodies(messages) if len(body.confidence)]
     if not found:
         return
@@ -132,6 +135,12 @@ def _confidence(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
             "confidence_zero",
             "confidence is 0 for every joint that has a position: expected 0 to 1; give 1 if the source has no "
             "confidences, and NaN positions for joints that it did not see",
+        )
+    elif seen.any() and most < needed:
+        yield warning(
+            "confidence_low",
+            f"confidence is {most:.2g} at most: expected 0 to 1, as a joint below {needed:g} counts as not seen; scale "
+            "it, or lower [prior.gate] min_confidence",
         )
 
 

@@ -86,10 +86,11 @@ class StreamCheck:
     Args:
         max_bodies: bodies that the prior tracks at once.
         identified: whether the prior assigns ids itself.
+        min_confidence: confidence below which the prior takes a joint as unobserved.
     """
 
-    def __init__(self, max_bodies: int, *, identified: bool = False) -> None:
-        self._max_bodies, self._identified = max_bodies, identified
+    def __init__(self, max_bodies: int, *, identified: bool = False, min_confidence: float = 0.0) -> None:
+        self._max_bodies, self._identified, self._min_confidence = max_bodies, identified, min_confidence
         self._window = Window()
         self._heard_ns = 0
         self._ended = False
@@ -138,7 +139,7 @@ class StreamCheck:
         if not messages:
             return
         stamps = list(check_stamps(arrivals, live=live))
-        names = list(check_layout(messages, self._max_bodies, identified=self._identified))
+        names = list(check_layout(messages, self._max_bodies, self._min_confidence, identified=self._identified))
         yield from (*stamps, *names)
         if not self._window.inhabited and self._window.received >= NOBODY:
             yield warning(
@@ -166,8 +167,8 @@ def _usable(problems: list[Problem]) -> bool:
 class StreamChecks:
     """The checks of all ``streams`` of a prior: a single one, or one per client, identified by its source."""
 
-    def __init__(self, max_bodies: int, *, identified: bool, streams: int) -> None:
-        self._new = partial(StreamCheck, max_bodies, identified=identified)
+    def __init__(self, max_bodies: int, *, identified: bool, streams: int, min_confidence: float = 0.0) -> None:
+        self._new = partial(StreamCheck, max_bodies, identified=identified, min_confidence=min_confidence)
         self._streams = streams
         self._checks: dict[str, StreamCheck] = {}
 

@@ -53,7 +53,12 @@ class PriorNode(Node):
         self._bodies = 0
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters)
-        self._checks = StreamChecks(settings.max_bodies, identified=settings.identify.enabled, streams=clients or 1)
+        self._checks = StreamChecks(
+            settings.max_bodies,
+            identified=settings.identify.enabled,
+            min_confidence=settings.gate.min_confidence,
+            streams=clients or 1,
+        )
         # such a replay has no timeline
         self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
         self._started_ns = self.clock.now_ns()

@@ -315,6 +315,14 @@ def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
     assert np.isfinite(poses.positions).all()
 
 
+def test_confidences_below_what_the_gate_takes_are_named(joints: np.ndarray) -> None:
+    confidence = np.full(joints.shape[:-1], 0.05)
+    with pytest.warns(steadypose.InputWarning, match="confidence_low: confidence is 0.05 at most"):
+        steadypose.clean(joints, fps=30, confidence=confidence)
+    lower = {"prior": {"gate": {"min_confidence": 0.01}}}
+    assert not steadypose.clean(joints, fps=30, confidence=confidence, settings=lower).problems
+
+
 def test_without_torch_a_fit_says_what_to_install(joints: np.ndarray, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"torch, .* extra 'train'"):

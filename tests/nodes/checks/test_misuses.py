@@ -167,6 +167,11 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "hardly a joint seen": (FOUR_SEEN, "few_joints", "the tracker's own threshold"),
     "a tracker that repeats itself": (body(lambda it, _: walk(0.1)[0].bodies[0]), "frozen", "repeats its last answer"),
     "confidences of zero": (confidence(np.zeros_like), "confidence_zero", "give 1"),
+    "confidences of hardly anything": (
+        confidence(lambda it: it * 0.05),
+        "confidence_low",
+        "below 0.1 counts as not seen",
+    ),
     "confidences to a hundred": (confidence(lambda it: it * 100), "confidence_range", "divide by 100"),
     "confidences to 255": (confidence(lambda it: it * 255), "confidence_range", "divide by 255"),
     "confidences below zero": (confidence(lambda it: it - 2), "confidence_range", "below 0 counts as 0"),
@@ -187,7 +192,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
 
 def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str, tuple[float, Level, str]]:
     """What is told of a stream that comes at its own rate: by cause, when first, in seconds from the first message."""
-    check, found, due = StreamCheck(max_bodies), {}, START_NS + SECOND_NS
+    check, found, due = StreamCheck(max_bodies, min_confidence=0.1), {}, START_NS + SECOND_NS
     for index, raw in enumerate(frames):
         at_ns = START_NS + index * SECOND_NS // 30
         while at_ns >= due:
