@@ -5,7 +5,6 @@ _TIMES = "it measures times; since, the pose of somebody who enters the image ha
 STALE = {
     "latency": _TIMES,
     "restart": _TIMES,
-    "rotations": "the root of `crossing` is off by 8.9 / 19.6 degrees since, as somebody enters; the rest is as here",
     "scale": _TIMES,
     "soak": "it takes its stream from latency.py, whose tables also give a numpy workload's time since",
 }

@@ -6,7 +6,8 @@ from __future__ import annotations
 STUDIES: dict[str, str] = {
     "fidelity": "error by speed of the joint, noise and delay; what is left of a swing",
     "kinect_vicon": "real Kinect against Vicon, each of eight people left out",
-    "rotations": "orientations of joints; heading from a real Kinect",
+    "rotations": "orientations of joints, on motion whose files have them",
+    "heading": "heading from a real Kinect; the root in the bundled streams",
     "mediapipe": "real MediaPipe beside four cameras",
     "noisy_joints": "independent and correlated noise, spikes, exchanged limbs",
     "hidden_joints": "joints below 0.9 m, an arm behind the body, limbs away for 0.2 to 2 s",
@@ -25,13 +26,14 @@ STUDIES: dict[str, str] = {
 
 SENSORS = {
     "kinect_vicon": "ui_prmd.npz",
-    "rotations": "ui_prmd.npz",
+    "rotations": "dancedb.tar.xz",
+    "heading": "ui_prmd.npz",
     "mediapipe": "mediapipe_pose.npz",
     "contacts": "contacts_grf.npz",
 }
 """Studies with their own recordings, and the file of each."""
 
-NO_SPLIT = ("kinect_vicon", "mediapipe", "contacts", "counter")
+NO_SPLIT = ("kinect_vicon", "heading", "mediapipe", "contacts", "counter")
 """Studies of people that have no test split, so that reading them is not logged."""
 
 PREPARED = ("event_mocap",)

@@ -1,4 +1,4 @@
-"""Orientations of joints on motion whose files have rotations, and the heading from a real Kinect.
+"""Orientations of joints on motion whose files have rotations.
 
 The input is joints, with noise, of people on whom nothing was trained (CMU's 02, DanceDB, LAFAN1; `rotations_truth`).
 Global orientations of the 17 joints that carry another are compared. A file's joint at rest has another orientation
@@ -6,18 +6,13 @@ than the canonical one. So the columns "file" compare with the file's orientatio
 and joint, fitted to the method's own output for the joints without noise (`rotations_truth.align`). They include the
 difference of definitions, which the rows without noise show. "Noise alone" compares with that output itself. The first
 two seconds of a clip are not scored.
-
-The root is the pelvis. A trunk's frame is steadier, but something else: the heading against the Vicon's hips is that of
-the pelvis, against the mean of hips and shoulders that of the trunk, which `hips and shoulders` measures by definition.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,10 +30,9 @@ from steadypose.benchmarks.baselines.rotations import (
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
 from steadypose.benchmarks.intervals import Interval, ratio
-from steadypose.benchmarks.provenance import ROOT, VARIANTS
+from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped, starts_of
-from steadypose.benchmarks.studies.kinect_clips import side_by_side
 from steadypose.benchmarks.studies.rotations_truth import (
     SCORED,
     SKIPPED,
@@ -46,69 +40,19 @@ from steadypose.benchmarks.studies.rotations_truth import (
     angle,
     read,
     score,
-    spread,
-    tilt_between,
-    wrapped,
 )
-from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
-from steadypose.prior.body.kinematics import (
-    global_rotations,
-    heading,
-    quaternion_product,
-    rotation_matrices,
-    rotation_matrix,
-)
-from steadypose.prior.body.skeleton import J
-from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.clean.settings import OrientSettings, PriorSettings, RefineSettings
 from steadypose.prior.fit.bodies import lowest_floor
 from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.fit.windows import Track, fit_track
 from steadypose.prior.models.posture import RootCovariance
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
 
-STREAMS = ROOT / "sim_data"
-
-
-def root_errors(methods: Mapping[str, PriorSettings]) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Return errors of root, heading and tilt by stream and method: median and 95th percentile, degrees."""
-    return {
-        path.parent.name: {name: _errors(path.parent, settings) for name, settings in methods.items()}
-        for path in sorted(STREAMS.glob("*/metadata.yaml"))
-    }
-
-
-def _errors(path: Path, settings: PriorSettings) -> dict[str, list[float]]:
-    prior, raw, truth = PriorPipeline(settings), [], {}
-    for _, message in open_recording(path):
-        if isinstance(message, PoseRaw):
-            raw.append(message)
-        elif isinstance(message, PoseWorld):
-            truth |= {(message.stamp_ns, body.id): body.root_orientation for body in message.bodies}
-    stamps = np.array(sorted({stamp for stamp, _ in truth}))
-    pairs: list[tuple[Floats, Floats]] = []
-    for clean in [clean for message in raw for clean in prior.process(message)] + prior.flush():
-        nearest = int(stamps[np.abs(stamps - clean.stamp_ns).argmin()])
-        if abs(nearest - clean.stamp_ns) * 1e-9 > 0.5 / FPS:
-            continue
-        for body in clean.bodies:
-            if (nearest, body.id) in truth:
-                root = quaternion_product(clean.sensor_pose.orientation, body.rotations[0].astype(np.float64))
-                pairs.append((rotation_matrix(root), rotation_matrix(truth[nearest, body.id])))
-    found, true = (np.stack(part) for part in zip(*pairs, strict=True))
-    return {
-        "root": spread(angle(found.swapaxes(-1, -2) @ true)),
-        "heading": spread(wrapped(heading(found) - heading(true))),
-        "tilt": spread(tilt_between(found, true)),
-    }
-
-
-DEPENDS_ON = (*VARIANTS, "humor weights", "prior.fit")
+DEPENDS_ON = (*VARIANTS_22, "humor weights", "prior.fit")
 
 DELAY, FIT_DELAY = PriorSettings().delay, 8
 """Delays of the live output that is scored, and of that from which fits start, frames."""
@@ -144,10 +88,6 @@ CONDITIONS: Mapping[str, Callable[[Floats, np.random.Generator], Floats]] = {
 """Errors of joints (T, C, 22, 3), metres."""
 
 
-_PARTS = {"pelvis": ("hip",), "trunk": ("hip", "shoulder")}
-"""Parts whose heading the Kinect's is compared with."""
-
-
 class _Turned(NamedTuple):
     """Output of one method: orientations (T, C, 17, 3, 3), and the root's covariance (T, C, 3, 3) rad²."""
 
@@ -156,7 +96,7 @@ class _Turned(NamedTuple):
 
 
 def run(bench: Bench) -> Result:
-    """Run every method in every condition; then the real Kinect."""
+    """Run every method in every condition."""
     assert bench.mocap is not None
     clips = read(bench.mocap, bench.split, 4 if bench.quick else 8)
     rng, scored = np.random.default_rng(bench.seeds[0]), slice(SKIPPED, None)
@@ -186,11 +126,9 @@ def run(bench: Bench) -> Result:
                 _rounded(ratio(off, plain, clips.person)) if condition != PERFECT else None
             )
             records.append(record)
-    kinect, bundled = _kinect(bench, roots), root_errors({name: METHODS[name] for name in (AIMED, STEADYPOSE)})
     data = {"clips": {source: int((clips.source == source).sum()) for source in np.unique(clips.source)},
-            "people": len(set(clips.person)), "records": records, "kinect": kinect, "bundled": bundled}  # fmt: skip
-    tables = [_table(records, tuple(roots)), _bends(records), _kinect_table(kinect), _bundled_table(bundled)]
-    return Result(tables, data)
+            "people": len(set(clips.person)), "records": records}  # fmt: skip
+    return Result([_table(records, tuple(roots)), _bends(records)], data)
 
 
 def _rounded(found: Interval) -> list[float]:
@@ -216,7 +154,7 @@ def _answers(seen: Floats, roots: Mapping[str, Baseline], net: RotationNet, dens
     joints, unknown = seen, np.full((*seen.shape[:2], 3, 3), np.nan)
     for name, settings in METHODS.items():
         cleaned = product.run(settings, seen, np.arange(len(seen)) / FPS, DELAY)
-        turned = global_rotations(_matrices(cleaned.rotations))[:, :, list(SCORED)]
+        turned = global_rotations(matrices(cleaned.rotations))[:, :, list(SCORED)]
         found[name] = _Turned(turned, _covariance(cleaned, turned) if name == STEADYPOSE else unknown)
         joints = cleaned.positions if name == STEADYPOSE else joints
     found[FIT] = _Turned(_fitted(seen), unknown)
@@ -245,7 +183,8 @@ def _covariance(cleaned: product.Cleaned, turned: Floats) -> Floats:
     return RootCovariance()(*parts).reshape(turned[:, :, 0].shape)
 
 
-def _matrices(quaternions: Floats) -> Floats:
+def matrices(quaternions: Floats) -> Floats:
+    """Return rotations (..., 3, 3) of quaternions (..., 4) that were rounded to float32."""
     return rotation_matrices(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
 
 
@@ -260,41 +199,12 @@ def _ratio(found: _Turned, truth: Floats, scored: slice) -> float:
     return round(float((error[known] * white).sum(axis=-1).mean()) / 3.0, 3)
 
 
-def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, dict[str, list[float]]]:
-    """Return heading errors against Vicon's `_PARTS`: median and 95th percentile, degrees.
-
-    Each clip's median is subtracted, because the two systems define "hip" differently.
-    """
-    assert bench.mocap is not None
-    pairs = [pair for subject in VALIDATION_SUBJECTS for pair in
-             load_pairs(bench.mocap / "ui_prmd.npz", (subject,))[:: 40 if bench.quick else 6]]  # fmt: skip
-    seen = side_by_side([pair.kinect for pair in pairs])
-    off: dict[str, dict[str, list[Floats]]] = {}
-    for name, settings in METHODS.items():
-        cleaned = product.run(settings, seen, np.arange(len(seen)) / FPS, DELAY, "kinect22")
-        for clip, pair in enumerate(pairs):
-            length = len(pair.kinect)
-            mine = {name: _matrices(cleaned.rotations[:length, clip, 0])}
-            if name == STEADYPOSE:
-                mine |= {other: root(cleaned.positions[:length, clip]) for other, root in roots.items()}
-            for (of, parts), (method, turned) in itertools.product(_PARTS.items(), mine.items()):
-                apart = wrapped(heading(turned) - _heading(pair.vicon, parts))
-                off.setdefault(of, {}).setdefault(method, []).append(apart - np.nanmedian(apart))
-    return {of: {method: spread(np.concatenate(parts)) for method, parts in each.items()} for of, each in off.items()}
-
-
-def _heading(vicon: Floats, parts: Sequence[str]) -> Floats:
-    """Return the heading (T,) of joints (T, 22, 3), radians: the mean direction of these parts from right to left,
-    turned forward."""
-    left = np.sum([vicon[:, J[f"left_{part}"]] - vicon[:, J[f"right_{part}"]] for part in parts], axis=0)
-    return np.arctan2(-left[:, 0], left[:, 1])
-
-
 def _share(values: list[float] | None) -> str:
     return "" if values is None else f"{values[0]:.2f} ({values[1]:.2f} to {values[2]:.2f})"
 
 
-def _pair(values: list[float]) -> str:
+def pair(values: list[float]) -> str:
+    """Return a median and a 95th percentile as text."""
     return f"{values[0]:.1f} / {values[1]:.1f}"
 
 
@@ -308,9 +218,9 @@ def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
         rows.append(
             [
                 f"{record['noise']}: {record['method']}",
-                *(_pair(part["all"]) if whole else "" for part in (alone, against)),
-                *(_pair(alone[key]) for key in ("root", "heading", "tilt")), _pair(against["root"]),
-                *(_pair(alone[key]) if whole else "" for key in ("direction", "twist")),
+                *(pair(part["all"]) if whole else "" for part in (alone, against)),
+                *(pair(alone[key]) for key in ("root", "heading", "tilt")), pair(against["root"]),
+                *(pair(alone[key]) if whole else "" for key in ("direction", "twist")),
                 f"{alone['turn beyond']:.2f}" if whole else "", f"{alone['root turn beyond']:.2f}",
                 "" if math.isnan(variance) else f"{variance:.2f}",
                 _share(record["root, of aimed bones'"]),
@@ -335,35 +245,12 @@ def _bends(records: list[dict[str, Any]]) -> Table:
     rows = [
         [
             f"{record['noise']}: {record['method']}",
-            *(_pair(record["file"]["by bend"][bend]["twist"]) for bend in ("straight", "half", "bent")),
-            *(_pair(record["file"]["by speed"][speed]) for speed in ("slow", "middling", "fast")),
+            *(pair(record["file"]["by bend"][bend]["twist"]) for bend in ("straight", "half", "bent")),
+            *(pair(record["file"]["by speed"][speed]) for speed in ("slow", "middling", "fast")),
         ]
         for record in kept
     ]
     return Table(
         "rotations-bend", "Rotations by bend of the limb (twist of hips and shoulders) and by speed, degrees, file",
         ["noise: method", "straight, < 10°", "10 to 30°", "bent", "< 0.5 m/s", "0.5 to 1.5", "faster"], rows,
-    )  # fmt: skip
-
-
-def _kinect_table(kinect: Mapping[str, Mapping[str, list[float]]]) -> Table:
-    return Table(
-        "rotations-kinect", "Real Kinect: heading in degrees, median / 95th percentile",
-        ["method", *kinect],
-        [[method, *(_pair(each[method]) for each in kinect.values())] for method in kinect["pelvis"]],
-        "UI-PRMD's s07 and s08, each clip's median removed, delay 4. Pelvis: against Vicon's hips, which a root's "
-        "heading means; trunk: against the mean of hips and shoulders.",
-    )  # fmt: skip
-
-
-def _bundled_table(bundled: Mapping[str, Mapping[str, Mapping[str, list[float]]]]) -> Table:
-    return Table(
-        "rotations-bundled", "The bundled streams: error of the root in degrees, median / 95th percentile",
-        ["stream: method", "root", "heading", "tilt"],
-        [
-            [f"{stream}: {method}", *(_pair(errors[part]) for part in ("root", "heading", "tilt"))]
-            for stream, methods in bundled.items()
-            for method, errors in methods.items()
-        ],
-        "Against the simulator's pelvis, from `sim_data/`, as published.",
     )  # fmt: skip
