@@ -42,7 +42,8 @@ def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, 
 
     read("world", "test")  # simulated people, as there is no prepared motion
     data.touch()
-    (tmp_path / "ui_prmd.npz").touch()
+    for name in ("ui_prmd.npz", "dancedb.tar.xz"):
+        (tmp_path / name).touch()
     read("world", "val")
     read("kinect_vicon", "test")  # has no split
     assert not log.exists()
