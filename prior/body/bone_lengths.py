@@ -13,6 +13,7 @@ from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import (
     COLLARS,
     HIPS,
+    JOINTS,
     LIMB_ENDS,
     MIRROR,
     PARENTS,
@@ -32,12 +33,16 @@ gives 0.02 to 0.07 for arms and legs. Trunk, head and feet vary more, because se
 TRUNK_PLACE_SPREAD = 0.05
 """Standard deviation between sensors, along an axis, of hips, neck and shoulders on the trunk, metres."""
 
+STRAIGHT = 90.0
+"""Percentile of the distances between the ends of a limb without its elbow or knee at which the limb is straight."""
+
 LENGTH_BIASES = 3.0
 """Least error of a single sample of a bone, as a multiple of the sensor's bias. Successive samples share most of it."""
 
 LIKE_SAMPLES = 12
 """Correlation time of the samples' errors, samples (two seconds): that many count as one independent sample."""
 
+_LIMBS_MIDDLES = {joint for joint, name in enumerate(JOINTS) if name.endswith(("elbow", "knee"))}
 _COLLAR_TO_SHOULDER = SHOULDERS[0] - COLLARS[0]
 
 
@@ -153,13 +158,17 @@ def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats,
     return placed
 
 
+def _around_shoulder(path: list[int]) -> bool:
+    return not {*SHOULDERS}.isdisjoint(path[1:])
+
+
 def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     """Estimate a person's bones robustly from a set of poses.
 
     Bone lengths are medians over the frames. Bones keep their directions from the rest pose. The exceptions are bones
     fixed to pelvis and chest (hips, neck, collars), whose directions differ between sensors. They take the median
     vector in the trunk's frame. A joint that was never observed is placed by scaling the rest pose between its observed
-    neighbours.
+    neighbours: an elbow or a knee to the straight limb, a shoulder to the person's size.
 
     Args:
         positions: (T, 22, 3) metres, NaN where unobserved.
@@ -170,10 +179,14 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     p = np.asarray(positions, dtype=np.float64)
     offsets = REST_OFFSETS.copy()
     seen = np.asarray(finite_joints(p).any(axis=0))
-    for path in _bones(seen):
+    ratios: list[float] = []
+    for path in sorted(_bones(seen), key=_around_shoulder):
         lengths = np.linalg.norm(p[:, path[0]] - p[:, PARENTS[path[-1]]], axis=-1)
-        if np.isfinite(lengths).any():
-            offsets[path] *= np.nanmedian(lengths) / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
+        lengths = lengths[np.isfinite(lengths)] / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
+        if len(lengths):
+            ratios.append(float(np.percentile(lengths, STRAIGHT if _LIMBS_MIDDLES & {*path[1:]} else 50.0)))
+            # arms hang, so that collar and elbow are never as far apart as their bones are long
+            offsets[path] *= np.median(ratios[:-1]) if _around_shoulder(path) and len(ratios) > 1 else ratios[-1]
     world = global_rotations(solve_rotations(p, offsets))
     for trunk, children in ((J["pelvis"], HIPS), (J["spine3"], (J["neck"], *COLLARS))):
         for joint in children:

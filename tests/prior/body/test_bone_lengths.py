@@ -4,7 +4,7 @@ from tests.helpers.bodies import fk, random_pose, waving
 
 from steadypose.prior.body.bone_lengths import estimate_bones, estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_pose
-from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
 
 BIAS, NOISE = 0.02, 0.01
 LEFT_HIP, RIGHT_KNEE = J["left_hip"], J["right_knee"]
@@ -97,3 +97,32 @@ def test_bones_between_joints_that_are_never_seen_span_the_gap() -> None:
     )
     placed = solve_pose(positions, estimate)[1]
     assert np.nanmedian(np.linalg.norm(placed - positions, axis=-1)[:, J["left_shoulder"]]) < 0.01
+
+
+def test_a_bent_limb_does_not_shorten_bones_around_a_joint_that_is_never_seen() -> None:
+    """Arms hang from the shoulders, and a knee is straight now and then."""
+    arm, leg = [J["left_shoulder"], J["left_elbow"]], [J["left_knee"], J["left_ankle"]]
+    bones = REST_OFFSETS * 1.1
+    posture = REST_OFFSETS.copy()
+    for side in ("left", "right"):
+        for part in ("elbow", "wrist"):
+            posture[J[f"{side}_{part}"]] = [0.0, 0.0, -np.linalg.norm(REST_OFFSETS[J[f"{side}_{part}"]])]
+    positions = np.empty((20, 22, 3))
+    for frame in range(20):
+        bent = posture.copy()
+        if frame >= 6:  # sits
+            for side in ("left", "right"):
+                bent[J[f"{side}_ankle"]] = [-np.linalg.norm(REST_OFFSETS[J[f"{side}_ankle"]]), 0.0, 0.0]
+        for joint, parent in enumerate(PARENTS):
+            positions[frame, joint] = positions[frame, max(parent, 0)] * (joint > 0) + 1.1 * bent[joint]
+    for unseen, chain in (("shoulder", arm), ("knee", leg)):
+        shown = positions.copy()
+        shown[:, [J[f"{side}_{unseen}"] for side in ("left", "right")]] = np.nan
+        np.testing.assert_allclose(lengths(estimate_offsets(shown))[chain], lengths(bones)[chain], rtol=0.02)
+
+
+def test_an_arm_alone_has_the_bones_that_its_ends_span() -> None:
+    positions = np.full((3, 22, 3), np.nan)
+    positions[:, J["left_collar"]], positions[:, J["left_elbow"]] = 0.0, [0.0, 0.3, 0.0]
+    chain = [J["left_shoulder"], J["left_elbow"]]
+    assert np.linalg.norm(estimate_offsets(positions)[chain].sum(axis=0)) == pytest.approx(0.3)
