@@ -32,6 +32,10 @@ DRIFT, MAX_DRIFT, LONG = 0.0045, 0.14, 60.0
 metres, and length of gaps with the full drift in frames. In shorter gaps, drift is proportional to their length. Values
 are from validation people, whose RMS drift reaches 135 mm."""
 
+WANDER = 0.00115
+"""Drift of a body whose velocity is a random walk, between two known ends s and u frames away: metres along an axis,
+times (s u / (s + u))^1.5. In gaps of more than 3 s and beyond a recording's ends it exceeds the other (validation)."""
+
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -62,6 +66,9 @@ class Uncertainty:
         since, until = frames_since_and_until(known[:, :1])
         rootless = np.minimum(since, until) * np.minimum((since + until) / LONG, 1.0)
         drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MAX_DRIFT)
+        with np.errstate(divide="ignore"):
+            between = 1.0 / (1.0 / since + 1.0 / until)
+        drift = np.maximum(drift, WANDER * np.where(np.isfinite(between), between, 0.0) ** 1.5)
         guessed = np.hypot(guessed, drift)
         return np.where(known, noise, guessed)
 

@@ -160,6 +160,22 @@ def test_doubt_grows_from_what_is_known() -> None:
     assert (sigma[:19, 18] < 0.01).all()
 
 
+@pytest.mark.parametrize(
+    ("gap", "at", "drift"),
+    [
+        (slice(30, 60), 44, 0.0045 * 15 * 31 / 60),  # 15 and 16 frames from its ends
+        (slice(30, 149), 89, 0.00115 * 30**1.5),  # 60 from both
+        (slice(30, 269), 149, 0.00115 * 60**1.5),  # 120 from both
+        (slice(260, 300), 299, 0.00115 * 40**1.5),  # 40 after the last
+    ],
+)
+def test_doubt_of_a_body_on_its_way_grows_with_the_gap(gap: slice, at: int, drift: float) -> None:
+    seen = waving(300)
+    seen[gap] = np.nan
+    sigma = Uncertainty((0.0,) * 22, 1e-9).of(seen)
+    np.testing.assert_allclose(sigma[at, 0], np.sqrt(drift**2 + 0.015**2 + sigma[0, 0] ** 2), rtol=1e-6)
+
+
 class Walks:
     """A network that predicts of everybody that they walk forward at 1 m/s."""
 
