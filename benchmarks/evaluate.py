@@ -99,15 +99,17 @@ def _missing(study: str, mocap: Path | None, data: Path) -> str | None:
 
 
 def _file(name: str, room: str, bench: Bench, result: Result, module: Any, seconds: float, directory: Path) -> Path:
-    from steadypose.benchmarks.results import save
+    from steadypose.benchmarks.results import PICTURES, RESULTS, save
 
     options = [name, *(["--split", bench.split] if room == "studies" else []), *(["--quick"] if bench.quick else [])]
     if name in SENSORS:
         options += ["--mocap", "mocap"]
     content = {
-        "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1), **result.data
+        "quick": bench.quick, "split": bench.split, "seeds": bench.seeds, "seconds": round(seconds, 1),
+        "pictures": list(result.figures), **result.data,
     }  # fmt: skip
     path = save(name, ["steadypose", "evaluate", *options], result.tables, content, module, directory)
+    pictures = PICTURES if directory == RESULTS else directory
     for stem, figure in result.figures.items():
-        figure.savefig(directory / f"{stem}.png", dpi=110)
+        figure.savefig(pictures / f"{stem}.png", dpi=110)
     return path

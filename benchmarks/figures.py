@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator
 
 COLOURS = {
     "raw": "#888888",
@@ -28,6 +29,10 @@ COLOURS = {
     "steadypose, sensor known": "#5b2a86",
 }
 """Colour of each method in every plot; other methods take matplotlib's next."""
+
+
+_CENTIMETRES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""Ticks of deviations, cm."""
 
 
 def curves(
@@ -76,7 +81,7 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: s
         bins: (predicted, observed, count) by group, metres.
         title: title of the plot.
     """
-    figure = Figure(figsize=(4.8, 4.4), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.4), layout="constrained")
     axis = figure.subplots()
     values = [v * 100 for rows in bins.values() for stated, found, _ in rows for v in (stated, found)]
     span = [0.8 * min(values), 1.25 * max(values)]
@@ -84,8 +89,12 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: s
     axis.fill_between(span, [0.8 * v for v in span], [1.2 * v for v in span], color="#444444", alpha=0.1, lw=0)
     for name, rows in bins.items():
         axis.plot([100 * s for s, _, _ in rows], [100 * f for _, f, _ in rows], marker="o", ms=4, label=name)
-    axis.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated, cm", ylabel="found, cm")
+    axis.set(xscale="log", yscale="log", xlim=span, ylim=span, aspect="equal", xlabel="stated, cm", ylabel="found, cm")
+    for scale in (axis.xaxis, axis.yaxis):
+        scale.set_major_locator(FixedLocator(_CENTIMETRES))
+        scale.set_major_formatter("{x:g}")
+        scale.set_minor_locator(NullLocator())
     axis.set_title(title, fontsize=10)
-    axis.grid(alpha=0.3, which="both")
-    axis.legend(fontsize=8, frameon=False)
+    axis.grid(alpha=0.3)
+    figure.legend(loc="outside right center", fontsize=8, frameon=False)
     return figure

@@ -25,12 +25,12 @@ _BLOCK = re.compile(r"(<!-- results:(?P<name>[\w-]+) -->\n).*?(<!-- /results -->
 
 HOW = """# Results
 
-Every table of `benchmarks/results/*.json`, written by `python -m steadypose.benchmarks.report`. Under each stand the
-command that makes it, the machine, the commit and the day. *Stale* marks what was measured before the pipeline's
-output, weights or the study changed, with the reason why it still stands; the code of a *finished study* is gone from
-here. Positions are in millimetres, accelerations in mm/frame² at 30 Hz; a delay is in frames of 30 Hz. Baselines are
-tuned on every third of the clips that are scored, with other noise; steadypose runs as it ships and has nothing to
-tune.
+Every table and picture of `benchmarks/results/*.json`, written by `python -m steadypose.benchmarks.report`. Under each
+table stand the command that makes it, the machine, the commit and the day. *Stale* marks what was measured before the
+pipeline's output, weights or the study changed, with the reason why it still stands; the code of a *finished study* is
+gone from here. Positions are in millimetres, accelerations in mm/frame² at 30 Hz; a delay is in frames of 30 Hz.
+Baselines are tuned on every third of the clips that are scored, with other noise; steadypose runs as it ships and has
+nothing to tune.
 """
 
 
@@ -77,11 +77,12 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[s
 
 
 def page(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """Return all tables, by study."""
+    """Return all tables and pictures, by study."""
     parts = [HOW]
     for name, result in results.items():
         parts.append(f"\n## {name.replace('_', ' ').capitalize()}\n")
         parts += [f"\n{markdown(table, result, reasons.get(name))}" for table in result["tables"]]
+        parts += [f"\n![{stem.replace('_', ' ')}](images/{stem}.png)\n" for stem in result.get("pictures", ())]
     return "".join(parts)
 
 

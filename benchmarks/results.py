@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from steadypose.benchmarks.provenance import RESULTS, code, machine, measured, require_committed
+from steadypose.benchmarks.provenance import RESULTS, ROOT, code, machine, measured, require_committed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PICTURES = ROOT / "docs" / "images"
+"""Folder of the studies' pictures, which docs/results.md shows."""
 READINGS = RESULTS / "test-readings.csv"
 """Log of every scoring of the test split. A split that is read often is being used for choices: if you change something
 after a reading, write the change into the last column."""

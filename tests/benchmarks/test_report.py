@@ -10,7 +10,7 @@ import pytest
 from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
 from steadypose.benchmarks.report import Args, fill, main, page
-from steadypose.benchmarks.results import Study, Table, load, save
+from steadypose.benchmarks.results import PICTURES, Study, Table, load, save
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
@@ -69,6 +69,13 @@ def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: 
     assert "**stale: the reason**" in fill(TEXT, results, {"latency": "the reason"})
     assert "code is at commit abc1234" in fill(levels, results, {})
     assert "**stale: the reason**" in page(results, {"latency": "the reason"})
+
+
+def test_the_page_shows_a_studys_pictures_and_each_is_there(tmp_path: Path) -> None:
+    result = saved(tmp_path) | {"pictures": ["noise_levels"]}
+    assert "![noise levels](images/noise_levels.png)" in page({"noisy_joints": result})
+    shown = {stem for one in load().values() for stem in one.get("pictures", ())}
+    assert shown == {path.stem for path in PICTURES.glob("*_*.png")}
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
