@@ -19,7 +19,8 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import NEEDED, Skeleton, middles
-from steadypose.prior.body.skeleton import COLLAR_SHARES, HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.body.mixtures import COLLAR
+from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
 Mixture = Mapping[str, float]
 
@@ -221,7 +222,7 @@ def _weights(source: str | Mixture) -> Mixture:
 
 def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) -> Mixture:
     """Return the rest skeleton's collar as a mixture of its neighbours."""
-    return mix(*zip((spine3, neck, shoulder), COLLAR_SHARES, strict=True))
+    return mix(*zip((spine3, neck, shoulder), COLLAR, strict=True))
 
 
 def recognise_points(names: Sequence[str]) -> Skeleton:

@@ -90,19 +90,6 @@ HIPS = (J["left_hip"], J["right_hip"])
 SHOULDERS = (J["left_shoulder"], J["right_shoulder"])
 COLLARS = (J["left_collar"], J["right_collar"])
 
-COLLAR_SHARES = (0.333, 0.278, 0.389)
-"""Shares of spine3, neck and shoulder in a collar, as in the rest pose. Rigs place collars differently, so a collar is
-this mean in all motion."""
-
-MIXTURES: Mapping[str, Mapping[str, float]] = {
-    "spine1": {"pelvis": 0.63, "spine3": 0.37},
-    "spine2": {"pelvis": 0.2, "spine3": 0.8},
-    "left_collar": dict(zip(("spine3", "neck", "left_shoulder"), COLLAR_SHARES, strict=True)),
-    "right_collar": dict(zip(("spine3", "neck", "right_shoulder"), COLLAR_SHARES, strict=True)),
-}
-"""Joints of the trunk as weighted means of others. Collars are so by definition; spine1 and spine2 of validation people
-are 14 and 4.5 mm off."""
-
 TRUNK = (J["pelvis"], *HIPS, J["spine1"], J["spine2"], J["spine3"], J["neck"], *SHOULDERS)
 """Joints whose positions relative to each other hardly depend on the pose."""
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
+from steadypose.prior.body.mixtures import mix
 from steadypose.prior.body.skeleton import PARENTS, finite_joints
 from steadypose.prior.complete.splines import smoothed, splines
 from steadypose.prior.complete.windows import AROUND, LONGEST_GAP, frames_apart, frames_since_and_until, gaps, views
@@ -141,6 +142,7 @@ def _completed(
         joints = np.where(known[..., None], positions, joints)
     share, line = splines(smooth, known)
     joints += share[..., None] * (line - joints)
+    joints = mix(joints, np.broadcast_to(~known.any(axis=0), known.shape))
     moved = bent | (share > 0).any(axis=1)
     if moved.any():
         rotations[moved] = solve_rotations(joints[moved], offsets, rotations[moved])

@@ -93,6 +93,20 @@ def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
     assert np.array_equal(done.known, known)
 
 
+def test_collars_that_are_never_known_are_means_and_others_are_completed() -> None:
+    positions = waving(40)
+    collars = [J["left_collar"], J["right_collar"]]
+    positions[:, collars] = np.nan
+    positions[10:20, J["left_wrist"]] = np.nan
+    done = complete(Oracle(waving(40)), positions, REST_OFFSETS).positions
+    shoulder, neck, spine3 = (done[:, J[name]] for name in ("right_shoulder", "neck", "spine3"))
+    np.testing.assert_allclose(done[:, J["right_collar"]], 0.333 * spine3 + 0.278 * neck + 0.389 * shoulder)
+    positions[0, collars] = waving(1)[0, collars]
+    done = complete(Oracle(waving(40)), positions, REST_OFFSETS).positions
+    mean = 0.333 * done[:, J["spine3"]] + 0.278 * done[:, J["neck"]] + 0.389 * done[:, J["right_shoulder"]]
+    assert np.abs(done[:, J["right_collar"]] - mean).max() > 0.001, "it was known once"
+
+
 def test_a_second_opinion_counts_where_a_part_is_hidden_and_nowhere_else() -> None:
     positions = waving(70)
     completer = LiveCompleter.load("default")
