@@ -163,7 +163,8 @@ class Gate:
             keep, swap = _kept_and_exchanged(positions, expected, pair)
             with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
                 exchanged = (keep > _SWAP_APART) & (swap < _SWAP_BETTER * keep) & known[:, pair].all(axis=1)
-            self._swapped[:, k] = np.where(exchanged, self._swapped[:, k] + 1, 0)
+            # most frames are right, so one exchanged frame does not confirm another at the beginning
+            self._swapped[:, k] = np.maximum(self._swapped[:, k] + np.where(exchanged, 1, -1), 0)
             overruled = self._swapped[:, k] > self._settings.patience * FPS
             if overruled.any():
                 exchanged &= ~overruled

@@ -94,6 +94,17 @@ def test_exchanged_legs_are_put_back() -> None:
     assert np.allclose(passed, positions)
 
 
+def test_a_body_whose_first_frame_is_exchanged_like_every_tenth_is_right_within_half_a_second() -> None:
+    positions = noisy(90, 0.01)
+    seen = positions.copy()
+    seen[::10] = positions[::10][:, MIRROR]
+    passed, _ = run(seen)
+    limbs = [J[f"{side}_{name}"] for side in ("left", "right") for name in ("wrist", "ankle")]
+    apart = np.linalg.norm(passed - positions, axis=-1)[:, limbs]
+    assert np.nanmax(apart[5]) > 0.2, "nothing tells yet which is right"
+    assert np.nanmax(apart[15:]) < 1e-9
+
+
 def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
     positions = noisy(90, 0.01)
     arms = [J[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist") for side in ("left", "right")]
