@@ -145,7 +145,7 @@ def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int])
 
 
 def clean_message(raw: PoseRaw, stamp_ns: int, delay_frames: int, bodies: list[CleanBody]) -> PoseClean:
-    """Build a source's output message. ``raw`` is its newest message, ``stamp_ns`` the output's time on its clock."""
+    """Build a source's output message, in the frame of its message ``raw``; ``stamp_ns`` is on the source's clock."""
     return PoseClean(
         stamp_ns=stamp_ns,
         frame_id=raw.frame_id,

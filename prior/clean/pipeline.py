@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Generic
@@ -132,7 +133,7 @@ class PriorPipeline(BodyPipeline[int]):
         self._resampler = Resampler(settings.max_bodies, delayed=settings.delay > 0)
         self._stamps = StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._sensor_pose = SensorPoseGate()
-        self._last: PoseRaw | None = None
+        self._lately: deque[PoseRaw] = deque()  # messages since the frame that is to be published next
 
     def process(self, raw: PoseRaw, *, gap: bool = False) -> list[PoseClean]:
         """Process a ``pose/raw`` message and return the ``pose/clean`` messages that it completes, oldest first.
@@ -155,8 +156,8 @@ class PriorPipeline(BodyPipeline[int]):
         if layout is None:
             return []
         flushed: list[PoseClean] = []
-        if self._last is not None:
-            step = raw.stamp_ns - self._last.stamp_ns
+        if self._lately:
+            step = raw.stamp_ns - self._lately[-1].stamp_ns
             if -BACKWARDS_NS < step <= 0:
                 self.counters["stamp_repeated" if step == 0 else "stamp_out_of_order"] += 1
                 return []
@@ -173,15 +174,15 @@ class PriorPipeline(BodyPipeline[int]):
             self.counters["sensor_moved"] += 1
             flushed += self._flush()
             self._sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
-        if self._last is None:
+        if not self._lately:
             self._origin_ns = raw.stamp_ns
-        self._last = raw
+        self._lately.append(raw)
         joints = self._arranged(raw, layout, SensorFrame.of(raw.sensor_pose), self._identify, int)
         ticks = self._resampler.update(raw.stamp_ns, *joints)
         if gap and len(ticks) > CATCH_UP:
             self.counters["frames_skipped"] += len(ticks) - CATCH_UP
             ticks = ticks[-CATCH_UP:]
-        return flushed + self._stepped(ticks, raw)
+        return flushed + self._stepped(ticks)
 
     def flush(self) -> list[PoseClean]:
         """Return the frames that the delay still holds, oldest first, and forget the stream."""
@@ -189,32 +190,34 @@ class PriorPipeline(BodyPipeline[int]):
         return held + self._flush()
 
     def _flush(self) -> list[PoseClean]:
-        last = self._last
         cleaned: list[PoseClean] = []
-        if last is not None:
-            cleaned += self._stepped(self._resampler.drain(), last)
-            cleaned += [self._message(frame, last) for frame in self._core.flush()]
+        if self._lately:
+            cleaned += self._stepped(self._resampler.drain())
+            cleaned += [self._message(frame) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))
         self._resampler.reset()
         self._sensor_pose.reset()
-        self._last = None
+        self._lately.clear()
         return cleaned
 
-    def _stepped(self, ticks: list[Frame], raw: PoseRaw) -> list[PoseClean]:
-        """Process frames of the 30 Hz grid and return the messages that they complete; ``raw`` is the newest input."""
-        origin = SensorFrame.of(raw.sensor_pose).origin
+    def _stepped(self, ticks: list[Frame]) -> list[PoseClean]:
+        """Process frames of the 30 Hz grid and return the messages that they complete."""
+        origin = SensorFrame.of(self._lately[-1].sensor_pose).origin
         frames = (self._advance_to(stamp_ns, BodyJoints(*joints), origin) for stamp_ns, *joints in ticks)
-        return [self._message(frame, raw) for frame in frames if frame is not None]
+        return [self._message(frame) for frame in frames if frame is not None]
 
     def _resamplers(self) -> Iterable[Resampler]:
         return (self._resampler,)
 
-    def _message(self, frame: CleanFrame, raw: PoseRaw) -> PoseClean:
-        """Build the output message, in the frame of the input message that completed it."""
+    def _message(self, frame: CleanFrame) -> PoseClean:
+        """Build the output message, in the sensor's frame at the time of the frame."""
+        stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
+        while len(self._lately) > 1 and self._lately[1].stamp_ns <= stamp_ns:
+            self._lately.popleft()
+        raw = min(itertools.islice(self._lately, 2), key=lambda message: abs(message.stamp_ns - stamp_ns))
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
         self._core.note_published(frame, bodies)
-        stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
         return clean_message(raw, stamp_ns, self.delay_frames, list(bodies.values()))
 
 
