@@ -21,6 +21,7 @@ from steadypose.prior.complete.body import Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import complete_raws
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -74,7 +75,8 @@ def _completed(path: Path) -> np.ndarray:
     raws = [message for _, message in islice(open_recording(path), FRAMES) if isinstance(message, PoseRaw)]
     del raws[40:70]
     completer = LiveCompleter.load("default")
-    done = complete_raws(path.name, raws, PartsCompleter(completer), Uncertainty(completer.config.never_sigma, 1)).done
+    uncertainty = Uncertainty(completer.config.never_sigma, 1, LivePosture.load("default"))
+    done = complete_raws(path.name, raws, PartsCompleter(completer), uncertainty).done
     return np.concatenate([np.ravel(completed.positions[np.isfinite(completed.positions)]) for _, completed in done])
 
 

@@ -24,6 +24,7 @@ from steadypose.prior.complete.body import Fill, Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
@@ -66,7 +67,8 @@ class CompletedSource(NamedTuple):
 def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
     """Load the completer of a weight set, and its output's uncertainty."""
     completer = LiveCompleter.load(weights)
-    return PartsCompleter(completer), Uncertainty(completer.config.never_sigma, completer.config.half_frames)
+    config, posture = completer.config, LivePosture.load(weights)
+    return PartsCompleter(completer), Uncertainty(config.never_sigma, config.half_frames, posture)
 
 
 def complete_source(

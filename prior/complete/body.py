@@ -16,17 +16,24 @@ import numpy as np
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.mixtures import mix
-from steadypose.prior.body.skeleton import PARENTS, finite_joints
+from steadypose.prior.body.skeleton import HIPS, PARENTS, J, finite_joints, limbs
 from steadypose.prior.complete.splines import smoothed, splines
 from steadypose.prior.complete.windows import AROUND, LONGEST_GAP, frames_apart, frames_since_and_until, gaps, views
 from steadypose.prior.models.completer_features import rotations_of_6d
 from steadypose.prior.models.line import draw_line
+from steadypose.prior.models.posture import LivePosture
 
 MIN_SIGMA = 0.002
 """Least standard deviation of a given joint along an axis, metres."""
 
 MIN_NEVER = 0.015
 """Least standard deviation along an axis of a joint that was never given, metres."""
+
+_WAIST, UNSEEN_WAIST = [J["pelvis"], *HIPS], 0.12
+"""Least standard deviation along an axis of pelvis and hips if nothing from the hips down was ever given, metres
+(validation: 0.09, 0.15; the Gaussian of postures does not know how a trunk bends)."""
+_LOWER = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
+_HEAD = [J["neck"], J["head"]]
 
 DRIFT, MAX_DRIFT, LONG = 0.0045, 0.14, 60.0
 """Drift of a body in a gap without the pelvis: metres along an axis per frame from the gap's nearer end, maximum in
@@ -43,12 +50,14 @@ class Uncertainty:
     """Uncertainty of the completer's output, measured on validation people.
 
     Attributes:
-        never: (22,) metres along an axis, standard deviation of each joint if it is known in no frame.
+        far: (22,) metres along an axis, standard deviation of each joint far from the frames in which it is known.
         half: frames from a joint's nearest known frame at which its standard deviation is half of that.
+        posture: Gaussian of postures, for joints that are known in no frame.
     """
 
-    never: Sequence[float]
+    far: Sequence[float]
     half: float
+    posture: LivePosture
 
     def of(self, given: Floats) -> Floats:
         """(T, 22) metres along an axis, standard deviations of joints (T, 22, 3) metres, NaN where not given.
@@ -63,7 +72,12 @@ class Uncertainty:
             # 1.538 is the median length of a standard normal vector; a second difference has six times the variance
             noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), MIN_SIGMA)
         grown = 1.0 - self.half / (apart + self.half)
-        guessed = np.hypot(np.maximum(self.never, MIN_NEVER) * grown, noise)
+        ever: Bools = np.asarray(known.any(axis=0))
+        never = self.posture.sigma_given(ever)
+        never[_HEAD] = np.maximum(never[_HEAD], np.take(self.far, _HEAD))  # people hold it differently
+        if not ever[_LOWER].any():
+            never[_WAIST] = np.maximum(never[_WAIST], UNSEEN_WAIST)
+        guessed = np.hypot(np.maximum(np.where(ever, self.far, never), MIN_NEVER) * grown, noise)
         since, until = frames_since_and_until(known[:, :1])
         rootless = np.minimum(since, until) * np.minimum((since + until) / LONG, 1.0)
         drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MAX_DRIFT)

@@ -29,7 +29,6 @@ from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
 from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
 from steadypose.prior.complete.samples import draw
-from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import PERIOD_NS
@@ -130,10 +129,10 @@ def complete_raws(
     done: list[tuple[Stretch, Completed]] = []
     before = 0
     random = np.random.default_rng(seed)
-    covariance = None if seed is None else LivePosture.load("default").covariance
     for stretch in stretches:
         completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
-        if covariance is not None:
+        if seed is not None:
+            covariance = uncertainty.posture.covariance
             completed = draw(completed, uncertainty.of(stretch.given), stretch.offsets, covariance, random)
         done.append((stretch, completed))
         before += len(stretch.given)

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
 from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS, J
 from steadypose.prior.compiled import njit
@@ -120,6 +120,14 @@ class LivePosture:
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
         variance = np.diagonal(left, axis1=1, axis2=2).reshape(-1, 22, 3).mean(axis=-1)
         return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], np.sqrt(variance), root, turned)
+
+    def sigma_given(self, known: Bools) -> Floats:
+        """(22,) metres along an axis, standard deviations of joints given exactly those that are ``known`` (22,)."""
+        rows, left = np.repeat(known, 3), self.covariance.copy()
+        if rows.any():
+            across = self.covariance[:, rows]
+            left -= across @ np.linalg.solve(self.covariance[np.ix_(rows, rows)], across.T)
+        return np.sqrt(np.maximum(np.diagonal(left), 0.0).reshape(22, 3).mean(axis=1))
 
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:

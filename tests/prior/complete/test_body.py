@@ -16,9 +16,11 @@ from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
 from steadypose.prior.complete.windows import LONGEST, LONGEST_GAP, frames_apart, gaps, views
 from steadypose.prior.models.completer import LiveCompleter
+from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.models.root_velocity import NewestMotion
 from steadypose.prior.sim.noise import time_correlated
 
+POSTURE = LivePosture.load("default")
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 
 
@@ -168,10 +170,25 @@ def test_doubt_grows_from_what_is_known() -> None:
         assert apart[t, k] == (np.abs(rows - t).min() if len(rows) else np.inf)
     given_ = waving(60)
     given_[20:40, 18], given_[:, 20] = np.nan, np.nan
-    sigma = Uncertainty((0.1,) * 22, 10.0).of(given_)
+    sigma = Uncertainty((0.1,) * 22, 10.0, POSTURE).of(given_)
     assert (np.diff(sigma[19:30, 18]) > 0).all()
-    assert np.allclose(sigma[:, 20], 0.1, atol=1e-3)
     assert (sigma[:19, 18] < 0.01).all()
+
+
+def test_doubt_of_a_joint_that_is_never_known_depends_on_what_is() -> None:
+    def of(*missing: str) -> np.ndarray:
+        seen = waving(10)
+        seen[:, [J[name] for name in missing]] = np.nan
+        return Uncertainty((0.0,) * 22, 10.0, POSTURE).of(seen)[0]
+
+    wrist, feet = J["left_wrist"], ("left_foot", "right_foot")
+    assert 0.05 < of("left_wrist")[wrist] < 0.8 * of("left_wrist", "left_elbow")[wrist]
+    assert of(*feet)[J["left_foot"]] < 0.04, "an ankle is known"
+    assert of(*feet, "left_ankle", "right_ankle")[J["left_foot"]] > 0.06
+    hips = ("pelvis", "left_hip", "right_hip")
+    legs = [f"{side}_{part}" for side in ("left", "right") for part in ("knee", "ankle", "foot")]
+    np.testing.assert_allclose(of(*hips, *legs)[[0, J["left_hip"]]], 0.12, rtol=1e-3)
+    assert of(*hips)[J["left_hip"]] < 0.03
 
 
 @pytest.mark.parametrize(
@@ -186,7 +203,7 @@ def test_doubt_grows_from_what_is_known() -> None:
 def test_doubt_of_a_body_on_its_way_grows_with_the_gap(gap: slice, at: int, drift: float) -> None:
     seen = waving(300)
     seen[gap] = np.nan
-    sigma = Uncertainty((0.0,) * 22, 1e-9).of(seen)
+    sigma = Uncertainty((0.0,) * 22, 1e-9, POSTURE).of(seen)
     np.testing.assert_allclose(sigma[at, 0], np.sqrt(drift**2 + 0.015**2 + sigma[0, 0] ** 2), rtol=1e-6)
 
 
