@@ -42,6 +42,9 @@ _MIDDLES: Mapping[str, Mapping[str, float]] = {
 """Canonical joints that may be means of the midpoints of left and right parts, with the weights of these. A pelvis lies
 above the hips, and a neck above the shoulders (training people: by 0.147 and 0.082 of their distance)."""
 
+INTERPOLATED = {"pelvis", "neck"}
+"""Canonical joints that `middles` interpolates; a head is in the middle of the ears."""
+
 INTERPOLATED_SIGMA = 0.025
 """Standard deviation along an axis of a pelvis or neck that is interpolated, metres. The error of validation people's
 is 17 and 34 mm (mean distance)."""
@@ -58,11 +61,13 @@ class Skeleton:
         name: the name that messages and files use.
         joints: the sensor's joint names, in the sensor's order.
         table: canonical joint -> sensor joint, or sensor joints with weights (normalised to sum to 1).
+        interpolated: canonical joints that are only about where the table has them.
     """
 
     name: str
     joints: tuple[str, ...]
     table: Mapping[str, str | Mapping[str, float]]
+    interpolated: frozenset[str] = frozenset()
 
     def index(self, joint: str) -> int:
         """Index of a sensor joint by name.
@@ -88,9 +93,8 @@ class Skeleton:
 
     @cached_property
     def sigma(self) -> NDArray[np.float64]:
-        """(22,) metres along an axis, error of the mapping; 0 but for joints interpolated between unlike ones."""
-        used = [weights[weights != 0.0] for weights in self.to_canonical]
-        return np.array([INTERPOLATED_SIGMA if len(set(weights)) > 1 else 0.0 for weights in used])
+        """(22,) metres along an axis, error of the mapping: of joints that are interpolated, 0 of others."""
+        return np.where([joint in self.interpolated for joint in JOINTS], INTERPOLATED_SIGMA, 0.0)
 
     @cached_property
     def observable(self) -> NDArray[np.bool_]:
@@ -148,7 +152,9 @@ def _described(name: str, description: object) -> Skeleton:
         raise ValueError(f"{where} canonical: expected a section, got {given!r}")
     table: dict[str, str | dict[str, float]] = {joint: joint for joint in JOINTS if joint in joints}
     ends = (f"{side}_{part}" for side in ("left", "right") for part in ("hip", "shoulder", "ear"))
-    table = middles({end: source for end in ends if (source := str(given.get(end, end))) in joints}) | table
+    between = middles({end: source for end in ends if (source := str(given.get(end, end))) in joints})
+    interpolated = between.keys() & INTERPOLATED - table.keys() - given.keys()
+    table = between | table
     for joint, source in given.items():
         if joint not in JOINTS:
             raise ValueError(f"{where} canonical: expected joints of smpl22 ({', '.join(JOINTS)}), got {joint!r}")
@@ -161,7 +167,7 @@ def _described(name: str, description: object) -> Skeleton:
         table[joint] = dict.fromkeys(names, 1.0) if len(names) > 1 else names[0]
     if missing := [joint for joint in NEEDED if joint not in table]:
         raise ValueError(f"{where} canonical: expected to find {', '.join(missing)}; say which of the joints they are")
-    return Skeleton(name, tuple(joints), table)
+    return Skeleton(name, tuple(joints), table, frozenset(interpolated))
 
 
 def _texts(value: object) -> list[str]:

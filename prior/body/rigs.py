@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import NEEDED, Skeleton, middles
+from steadypose.prior.body.layouts import INTERPOLATED, NEEDED, Skeleton, middles
 from steadypose.prior.body.mixtures import COLLAR
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
 
@@ -244,12 +244,15 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
             sided.setdefault(f"{sides.pop()}_{_PARTS.get(part, part)}", name)
         elif part in _MIDDLE_PARTS:
             table.setdefault(_MIDDLE_PARTS[part], name)
-    table = middles(sided) | table | {joint: name for joint, name in sided.items() if joint in JOINTS}
+    between = middles(sided)
+    interpolated = between.keys() & INTERPOLATED - table.keys()
+    table = between | table | {joint: name for joint, name in sided.items() if joint in JOINTS}
     if missing := [joint for joint in NEEDED if joint not in table]:
         raise RigError(
             f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with {BY_RIG} which"
         )
-    return Skeleton("points", tuple(dict.fromkeys(names)), {joint: table[joint] for joint in JOINTS if joint in table})
+    ordered = {joint: table[joint] for joint in JOINTS if joint in table}
+    return Skeleton("points", tuple(dict.fromkeys(names)), ordered, frozenset(interpolated))
 
 
 def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:

@@ -13,10 +13,11 @@ from tests.helpers.bvh_writer import Joint, write_bvh
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.rigs import UNITS, RigError, Tree, mirror_names, recognise, up_axis
+from steadypose.prior.body.rigs import UNITS, RigError, Tree, mirror_names, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_POSITIONS, J
+from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.files import Description, describe, read_motion
+from steadypose.prior.mocap.files import Description, describe, file_rig, read_motion
 
 HIPS_HEIGHT = 0.90
 """Metres above the ground, of the body that all families are given."""
@@ -175,6 +176,19 @@ def test_a_family_is_read_without_a_word(family: Family) -> None:
     assert (np.diff(heights) > 0).all()
     # In the world, too: on its feet, where the file has it.
     assert body[-1, J["left_hip"], 2] == pytest.approx(HIPS_HEIGHT - family.middle[0][1] / 100, abs=1e-3)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES.keys())
+def test_joints_that_a_rig_places_by_its_proportions_count_as_exact(family: Family) -> None:
+    bvh = read_bvh(write_bvh(family.joints(), family._placed((0.0, HIPS_HEIGHT, 0.0)), 50.0).decode())
+    rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, Description())
+    assert not rig.skeleton.sigma.any(), "a noise-free file stays what it is"
+
+
+def test_of_points_a_pelvis_and_a_neck_between_others_do_not() -> None:
+    names = [f"{side}{part}" for side in "LR" for part in ("Hip", "Shoulder", "Knee", "Ear")]
+    assert [JOINTS[j] for j in np.flatnonzero(recognise_points(names).sigma)] == ["pelvis", "neck"]
+    assert [JOINTS[j] for j in np.flatnonzero(recognise_points([*names, "Neck"]).sigma)] == ["pelvis"]
 
 
 def test_cmus_conversion_is_read_with_the_bones_that_it_lost() -> None:
