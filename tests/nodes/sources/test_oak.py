@@ -168,7 +168,7 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     for world in worlds[4:]:
         seen = world.bodies[0].positions[[JOINTS.index("left_hip"), JOINTS.index("right_hip")]].mean(axis=0)
         # a level camera: its x is the world's, its depth the world's y; how high it stands nobody told it
-        assert np.linalg.norm(path - seen[:2], axis=1).min() < 0.1
+        assert np.linalg.norm(path - seen[:2], axis=1).min() < 0.15, "they walk on the spot, which no root does"
         heights = world.bodies[0].positions[:, 2] - seen[2]
         assert np.nanmax(heights) == pytest.approx(0.6, abs=0.25), "upright: the neck, or the head"
         assert np.nanmin(heights) == pytest.approx(-0.9, abs=0.2), "the feet"
