@@ -189,6 +189,10 @@ def test_doubt_of_a_joint_that_is_never_known_depends_on_what_is() -> None:
     legs = [f"{side}_{part}" for side in ("left", "right") for part in ("knee", "ankle", "foot")]
     np.testing.assert_allclose(of(*hips, *legs)[[0, J["left_hip"]]], 0.12, rtol=1e-3)
     assert of(*hips)[J["left_hip"]] < 0.03
+    seen = waving(10)
+    seen[:, [J["neck"], J["head"]]] = np.nan
+    sigma = Uncertainty((0.1,) * 22, 10.0, POSTURE).of(seen)[0, [J["neck"], J["head"]]]
+    np.testing.assert_allclose(sigma, 0.1, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
