@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Mapping
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,16 @@ class BodyJoints(NamedTuple):
 
     positions: Floats
     confidence: Floats
+
+
+class Lately(deque[PoseRaw]):
+    """Messages of a stream since the frame that is to be published next, oldest first."""
+
+    def at(self, stamp_ns: int) -> PoseRaw:
+        """Return the message nearest to a frame's stamp, and forget those before it."""
+        while len(self) > 1 and self[1].stamp_ns <= stamp_ns:
+            self.popleft()
+        return min(islice(self, 2), key=lambda message: abs(message.stamp_ns - stamp_ns))
 
 
 def stacked(bodies: Collection[BodyJoints]) -> BodyJoints:

@@ -21,6 +21,7 @@ from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import Skeleton
 from steadypose.prior.clean.adapt import (
     BodyJoints,
+    Lately,
     clean_bodies,
     clean_message,
     end_of_stream,
@@ -50,13 +51,18 @@ class _Stream:
     resampler: Resampler  # to the shared grid; its slots are those of the batch
     identify: Identify | None  # None if the source assigns ids to its bodies
     offset_ns: float  # from its clock to the server's
-    last: PoseRaw  # its newest message
+    lately: Lately
     sensor_pose: SensorPoseGate
     time_ns: int = -1  # capture time of the newest message
     heard_ns: int = -1  # arrival time of the newest message
     first_ns: int = -1  # first and newest grid time with joints of this stream; negative before the first
     newest_ns: int = -1
     late: int = 0  # number of its frames in a row that came too late
+
+    @property
+    def last(self) -> PoseRaw:
+        """Its newest message."""
+        return self.lately[-1]
 
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):
@@ -116,7 +122,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         if raw.end_of_stream:
             if stream:
                 # only the sensor's pose of the last message is used, and the pose of this one was not checked
-                stream.last = dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose)
+                stream.lately.append(dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose))
                 stream.heard_ns = now_ns
         else:
             layout = layout_of(raw, self.counters)
@@ -172,7 +178,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 resampler=Resampler(self._settings.max_bodies, aligned=True, delayed=self._settings.delay > 0),
                 identify=self._new_identify(),
                 offset_ns=now_ns - raw.stamp_ns,
-                last=raw,
+                lately=Lately(),
                 sensor_pose=SensorPoseGate(),
                 heard_ns=now_ns,
             )
@@ -184,7 +190,8 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self.counters["stamp_out_of_order"] += 1
             stream.late += 1
             return
-        stream.last, stream.time_ns = raw, time_ns
+        stream.lately.append(raw)
+        stream.time_ns = time_ns
         # levelled, with the sensor at the origin, because the streams share no world frame
         sensor = SensorFrame.of(raw.sensor_pose).levelled()
         joints = self._arranged(raw, layout, sensor, stream.identify, lambda body_id: (raw.source, body_id))
@@ -252,10 +259,11 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 self._forget(name)
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
-            bodies = clean_bodies(frame, SensorFrame.of(stream.last.sensor_pose).levelled(), ids)
-            published |= bodies.keys()
             own_ns = max(stamp_ns - round(stream.offset_ns), 0)
-            cleaned.append(clean_message(stream.last, own_ns, self.delay_frames, list(bodies.values())))
+            raw = stream.lately.at(own_ns)
+            bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose).levelled(), ids)
+            published |= bodies.keys()
+            cleaned.append(clean_message(raw, own_ns, self.delay_frames, list(bodies.values())))
         self._core.note_published(frame, published)
         return cleaned
 

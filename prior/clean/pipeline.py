@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Generic
@@ -18,6 +17,7 @@ from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
     BodyJoints,
+    Lately,
     canonical_bodies,
     clean_bodies,
     clean_message,
@@ -133,7 +133,7 @@ class PriorPipeline(BodyPipeline[int]):
         self._resampler = Resampler(settings.max_bodies, delayed=settings.delay > 0)
         self._stamps = StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._sensor_pose = SensorPoseGate()
-        self._lately: deque[PoseRaw] = deque()  # messages since the frame that is to be published next
+        self._lately = Lately()
 
     def process(self, raw: PoseRaw, *, gap: bool = False) -> list[PoseClean]:
         """Process a ``pose/raw`` message and return the ``pose/clean`` messages that it completes, oldest first.
@@ -212,9 +212,7 @@ class PriorPipeline(BodyPipeline[int]):
     def _message(self, frame: CleanFrame) -> PoseClean:
         """Build the output message, in the sensor's frame at the time of the frame."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
-        while len(self._lately) > 1 and self._lately[1].stamp_ns <= stamp_ns:
-            self._lately.popleft()
-        raw = min(itertools.islice(self._lately, 2), key=lambda message: abs(message.stamp_ns - stamp_ns))
+        raw = self._lately.at(stamp_ns)
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
         self._core.note_published(frame, bodies)
