@@ -33,16 +33,7 @@ from steadypose.benchmarks.studies.kinect_clips import (
     move,
     score,
 )
-from steadypose.benchmarks.studies.kinect_methods import (
-    KNOWN,
-    RIDGE,
-    TCN,
-    UNKNOWN,
-    Kinect,
-    Method,
-    Stated,
-    run_ours,
-)
+from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Kinect, Method, Stated, run_ours
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.settings import PriorSettings

@@ -23,8 +23,7 @@ TEXT = "# Title\n<!-- results:speed -->\nold\n<!-- /results -->\ntail\n"
 
 
 PAPER: Any = SimpleNamespace(
-    __name__="steadypose.benchmarks.studies.hidden_joints",
-    DEPENDS_ON=("humor weights", "prior.fit"),
+    __name__="steadypose.benchmarks.studies.hidden_joints", DEPENDS_ON=("humor weights", "prior.fit")
 )
 """A study, as far as `save` looks at it."""
 

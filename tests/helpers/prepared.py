@@ -13,10 +13,7 @@ from steadypose.prior.body.skeleton import REST_OFFSETS
 
 
 def write_motion(
-    path: Path,
-    clips: Sequence[np.ndarray],
-    split: Sequence[str],
-    flat: Sequence[bool] | None = None,
+    path: Path, clips: Sequence[np.ndarray], split: Sequence[str], flat: Sequence[bool] | None = None
 ) -> Path:
     """Clips (T, 22, 3) metres, z up, of the rest skeleton; returns ``path``."""
     positions = np.concatenate(clips).astype(np.float32)

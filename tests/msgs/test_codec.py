@@ -12,14 +12,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from tests.helpers.msg_strategies import ANY, EXAMPLES, clean, diagnostics, raw
 
-from steadypose.msgs.codec import (
-    ROS_DEFINITIONS,
-    DecodeError,
-    decode,
-    encode,
-    typestore,
-    wire_type,
-)
+from steadypose.msgs.codec import ROS_DEFINITIONS, DecodeError, decode, encode, typestore, wire_type
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD, TOPICS
 from steadypose.msgs.types import Diagnostics, Message, PoseEvents
 

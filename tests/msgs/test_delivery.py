@@ -56,10 +56,7 @@ def test_an_heir_is_given_what_was_not_taken_and_what_it_asks_for_before(endpoin
 
 
 def test_nobody_else_hears_what_is_sent_again(endpoint: str) -> None:
-    with (
-        Publisher(endpoint, reliable={"reader"}) as publisher,
-        Subscriber(endpoint, POSE_RAW, name="other") as other,
-    ):
+    with Publisher(endpoint, reliable={"reader"}) as publisher, Subscriber(endpoint, POSE_RAW, name="other") as other:
         assert publisher.wait_for_subscribers(["other"], timeout_s=SOON_S)
         with reader(endpoint):
             assert publisher.wait_for_subscribers(["reader"], timeout_s=SOON_S)

@@ -78,11 +78,7 @@ def test_the_reader_reads(tmp_path: Path):
             writer.write(POSE_RAW, raw(second * 10**9), second * 10**9)
     with running(READER, tmp_path, str(tmp_path / "recording")) as process:
         printed, _ = process.communicate(timeout=SOON_S)
-    assert printed.splitlines() == [
-        "2.0 s of pose/raw pose/world",
-        "1000000000 [0. 1. 2.]",
-        "2000000000 [0. 1. 2.]",
-    ]
+    assert printed.splitlines() == ["2.0 s of pose/raw pose/world", "1000000000 [0. 1. 2.]", "2000000000 [0. 1. 2.]"]
 
 
 def test_the_publishers_frames_arrive(tmp_path: Path):

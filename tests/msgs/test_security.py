@@ -46,10 +46,7 @@ def test_a_directory_that_others_may_write_to_is_refused(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(
     ("use", "said"),
-    [
-        (make_private, "expected a directory of one's own"),
-        (load_keys, "belongs to user .*: expected keys"),
-    ],
+    [(make_private, "expected a directory of one's own"), (load_keys, "belongs to user .*: expected keys")],
 )
 def test_a_directory_of_somebody_else_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], object], said: str

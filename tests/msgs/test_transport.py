@@ -19,10 +19,7 @@ from steadypose.msgs import delivery
 from steadypose.msgs import publisher as publishing
 from steadypose.msgs.codec import encode
 from steadypose.msgs.delivery import PREFIX
-from steadypose.msgs.security import (
-    create_keys,
-    load_keys,
-)
+from steadypose.msgs.security import create_keys, load_keys
 from steadypose.msgs.subscriber import MAX_RECEIVED
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import MAX_FRAME, VERSION, Publisher, Subscriber, TransportError
@@ -91,10 +88,7 @@ def connected(
     endpoint: str, topics: str | Iterable[str] = POSE_RAW, **options: Any
 ) -> Iterator[tuple[Publisher, Subscriber]]:
     """A publisher, and a subscriber that is connected to it."""
-    with (
-        Publisher(endpoint) as publisher,
-        Subscriber(publisher.endpoint, topics, name="test", **options) as subscriber,
-    ):
+    with Publisher(endpoint) as publisher, Subscriber(publisher.endpoint, topics, name="test", **options) as subscriber:
         assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         yield publisher, subscriber
 

@@ -10,18 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.msg_strategies import EXAMPLES, clean, diagnostics, raw, world
 
 from steadypose.msgs.codec import DEFINITIONS
-from steadypose.msgs.types import (
-    CONTACTS,
-    JOINTS,
-    EventKind,
-    Hand,
-    JointState,
-    Phase,
-    Pose,
-    PoseRaw,
-    RawBody,
-    Tracking,
-)
+from steadypose.msgs.types import CONTACTS, JOINTS, EventKind, Hand, JointState, Phase, Pose, PoseRaw, RawBody, Tracking
 
 
 @pytest.mark.parametrize(

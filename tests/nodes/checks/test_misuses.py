@@ -180,11 +180,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "all ids the same": (bodies(lambda it: [it, moved(it, 1.0)]), "ids_repeated", "number them"),
     "eleven bodies": (bodies(lambda it: [moved(it, k, k) for k in range(11)]), "too_many_bodies", "max_bodies=11"),
     "two people under one id in turn": (ONE_ID_IN_TURN, "jumps", "prior.identify.enabled=true"),
-    "ten times the rate": (
-        stamp(lambda _, k: START_NS + 7 + k * 3_333_333),
-        "too_fast",
-        "set fps to the rate",
-    ),
+    "ten times the rate": (stamp(lambda _, k: START_NS + 7 + k * 3_333_333), "too_fast", "set fps to the rate"),
     "messages without bodies": (message(bodies=[]), "nobody", "leaves `bodies` empty"),
     "a calibration with another floor": (posed([0, 0, 1.4], [0.0, 0, 0, 1], True), "floor", "calibrate again"),
 }

@@ -165,10 +165,7 @@ def test_what_cannot_be_done_is_said(
         ({"camera_height": -1.0}, "more than 0"),
         ({"camera_height": np.nan}, "more than 0"),
         ({"keypoints": np.full((FRAMES, 22, 2), np.nan)}, "expected somebody"),
-        (
-            {"keypoints": np.full((FRAMES, 22, 2), [-0.2, 1.4])},
-            "expected pixels.*got -0.2 to 1.4.*multiply x by",
-        ),
+        ({"keypoints": np.full((FRAMES, 22, 2), [-0.2, 1.4])}, "expected pixels.*got -0.2 to 1.4.*multiply x by"),
         ({"fps": 0.0}, "fps"),
         ({"fps": 1e-9}, "fps"),
         ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),

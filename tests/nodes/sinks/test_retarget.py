@@ -29,14 +29,7 @@ pytest.importorskip("mink", reason="the extra 'retarget' is not installed")
 
 from steadypose.benchmarks.systems.retarget import faults
 from steadypose.nodes.sinks.datagrams import GONE_NS
-from steadypose.nodes.sinks.retarget import (
-    EASE_S,
-    SIDES,
-    Follower,
-    Retargeter,
-    RetargetNode,
-    RobotPose,
-)
+from steadypose.nodes.sinks.retarget import EASE_S, SIDES, Follower, Retargeter, RetargetNode, RobotPose
 from steadypose.nodes.sinks.robot import Robot, load_robot
 from steadypose.nodes.sinks.robot_feet import HELD, LAND_S, RELEASE_S, TURNED, Foot
 from steadypose.nodes.sinks.robot_solver import ROOT_M_S, ROOT_RAD_S

@@ -188,9 +188,7 @@ def test_transforms_lead_to_every_link(stream: Stream) -> None:
     assert (tracked.ids, stamp_ns(tracked.header)) == (["b0", "b1"], world.stamp_ns)
 
 
-def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
-    stream: Stream,
-) -> None:
+def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(stream: Stream) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
     pose = Pose(np.array([1.0, 2.0, 1.5]), np.array([0.5, -0.5, 0.5, -0.5]))
@@ -222,9 +220,7 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(
     assert not silent.of("tf_static")
 
 
-def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(
-    stream: Stream,
-) -> None:
+def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(stream: Stream) -> None:
     kept = Kept()
     topics = BodyTopics(kept, Ros2BridgeSettings())
     world = stream[1][-1]

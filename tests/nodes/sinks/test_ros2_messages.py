@@ -180,10 +180,7 @@ def test_a_sourced_ros_carries_them_as_well(tmp_path: Path, stream: dict[str, li
     last = {topic.replace("/", "_"): found[-1] for topic, found in stream.items()}
     for topic, message in last.items():
         (folder / f"{topic}.{KINDS[topic]}").write_bytes(encode(message))
-    with (
-        listener(tmp_path) as said,
-        sourced(SENDER, tmp_path, Path(sys.executable), str(folder)),
-    ):
+    with listener(tmp_path) as said, sourced(SENDER, tmp_path, Path(sys.executable), str(folder)):
         until(lambda: len(said) > 1, timeout_s=120)
     for topic, heard in json.loads(said[-1])["heard"].items():
         np.testing.assert_equal(heard, fields_of(last[topic]))

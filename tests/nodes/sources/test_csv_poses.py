@@ -71,9 +71,7 @@ def test_a_body_is_a_whole_number_that_fits(tmp_path: Path) -> None:
     rows = [f"0.{k},{body},1,1,1" for k, body in enumerate(["2.0", "1.5", "inf", "", "nan", "1e30", "-7"])]
     source = CsvSource(write(tmp_path / "x.csv", "stamp,body,nose_x,nose_y,nose_z", *rows))
     assert [body.id for _, message in source if isinstance(message, PoseRaw) for body in message.bodies] == [2, -7]
-    assert source.refused == {
-        "rows of which the body is no whole number of 32 bits, first row 3, column body: 1.5": 5,
-    }
+    assert source.refused == {"rows of which the body is no whole number of 32 bits, first row 3, column body: 1.5": 5}
 
 
 def test_a_skeleton_may_be_named(tmp_path: Path) -> None:

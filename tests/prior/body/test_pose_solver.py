@@ -5,13 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import fk, random_pose
 
-from steadypose.prior.body.inverse_kinematics import (
-    RIGID,
-    fit_lengths,
-    solve_pose,
-    solve_rotations,
-    write_swing,
-)
+from steadypose.prior.body.inverse_kinematics import RIGID, fit_lengths, solve_pose, solve_rotations, write_swing
 from steadypose.prior.body.kinematics import heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, REST_OFFSETS, J
 

@@ -177,8 +177,7 @@ def track(joints: np.ndarray, load: float = 0.5) -> FittedTrack:
 
 
 @pytest.mark.parametrize(
-    ("off", "before", "kept"),
-    [(0.03, 0.01, True), (0.05, 0.01, False), (0.05, 0.02, True), (np.nan, 0.01, False)],
+    ("off", "before", "kept"), [(0.03, 0.01, True), (0.05, 0.01, False), (0.05, 0.02, True), (np.nan, 0.01, False)]
 )
 def test_a_fit_has_failed_that_is_twice_and_two_centimetres_worse_than_clean(
     off: float, before: float, kept: bool, monkeypatch: pytest.MonkeyPatch

@@ -14,13 +14,7 @@ from steadypose.prior.camera.key_points import KeyPointRecording
 from steadypose.prior.fit import picture
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.observations import KeyPoints, Pinhole, SeenJoints, SurfacePoints
-from steadypose.prior.fit.picture import (
-    arrays_of_fit,
-    fit_key_points,
-    lift,
-    starts_of_key_points,
-    track_of_key_points,
-)
+from steadypose.prior.fit.picture import arrays_of_fit, fit_key_points, lift, starts_of_key_points, track_of_key_points
 from steadypose.prior.fit.solve import FitSettings, Start
 from steadypose.prior.fit.windows import FittedTrack
 

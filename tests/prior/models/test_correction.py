@@ -8,14 +8,7 @@ from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import MIRROR, J
 from steadypose.prior.clean.sensor_error import Correct
 from steadypose.prior.clean.settings import CorrectSettings
-from steadypose.prior.models.sensor_bias import (
-    FEATURES,
-    HISTORY,
-    CorrectionConfig,
-    features,
-    recall,
-    trunk_frame,
-)
+from steadypose.prior.models.sensor_bias import FEATURES, HISTORY, CorrectionConfig, features, recall, trunk_frame
 from steadypose.training.recipes.sensor_bias import CorrectionNet, mirror_features
 
 CAMERA = np.array([-3.0, 0.5, 1.2])

@@ -28,10 +28,7 @@ def random_rotations(*shape: int) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("config", "local", "deep"),
-    [
-        (HMVAEConfig(), (2, 12, 6), (2, 7, 6)),
-        (HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24), (2, 12, 12), (2, 7, 24)),
-    ],
+    [(HMVAEConfig(), (2, 12, 6), (2, 7, 6)), (HMVAEConfig(64, 15, (2, 2, 2, 2), 12, 24), (2, 12, 12), (2, 7, 24))],
 )
 def test_the_papers_two_window_lengths_have_the_official_latents(config, local, deep) -> None:
     model = HMVAE(config)
