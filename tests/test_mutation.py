@@ -84,5 +84,7 @@ def test_tests_that_are_not_there_kill_nothing(tmp_path: Path) -> None:
     assert mutation.passes(["test_it.py"], tmp_path)
     (tmp_path / "test_it.py").write_text("def test_it():\n    assert 1 - 1 == 2\n")
     assert not mutation.passes(["test_it.py"], tmp_path)
+    (tmp_path / "test_slow.py").write_text("import pytest\npytestmark = pytest.mark.slow\n\n\ndef test_it(): ...\n")
+    assert mutation.passes(["test_slow.py"], tmp_path), "left out, and so is a file of nothing else"
     with pytest.raises(ValueError, match="--tests"):
         mutation.passes(["nowhere.py"], tmp_path)
