@@ -1,7 +1,5 @@
 """Finds the tests of a piece of code: by what test files import, and by which functions run it."""
 
-from __future__ import annotations
-
 import ast
 from functools import cache
 from pathlib import Path

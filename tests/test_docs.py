@@ -10,8 +10,6 @@ A comment before a block says what is done with it:
 The streams are cut to two seconds, so that all of it takes little.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import select

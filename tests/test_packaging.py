@@ -1,7 +1,5 @@
 """The wrapper works where the caller stands; a wheel holds one package, with all that running takes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

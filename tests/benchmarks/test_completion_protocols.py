@@ -1,7 +1,5 @@
 """Interpolation and completion: figures that say what they should, baselines that do what their names say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

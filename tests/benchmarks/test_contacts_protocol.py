@@ -1,7 +1,5 @@
 """The protocol of force plates, on a recording made here: a foot that stands, and one that is lifted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

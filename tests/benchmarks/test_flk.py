@@ -1,7 +1,5 @@
 """FLK: what it follows, what it predicts, and that known bones stay as long as they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 """HuMoR's tables: scores of answers that are known, and the whole protocol in small."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Means over people and their intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

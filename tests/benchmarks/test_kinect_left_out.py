@@ -4,8 +4,6 @@ What is learned is held against the same with other recordings of that person: n
 with other recordings of somebody else, or nothing was learned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial

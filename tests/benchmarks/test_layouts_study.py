@@ -1,7 +1,5 @@
 """The study of sensors' layouts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The baselines for rotations: closed forms of the Kalman filter, and what the network's output has to be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Sentences that quote a figure quote the committed result: its cell, rounded as the sentence has it."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

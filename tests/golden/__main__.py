@@ -5,8 +5,6 @@ of a batch of two streams, and the ``.npz`` and MCAP that ``clean`` writes. Comp
 between processors, so this is a tool for refactoring and no test.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

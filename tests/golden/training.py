@@ -6,8 +6,6 @@ hashed. PREPARED is what ``prepare`` wrote; MOCAP is the folder of the recording
 made once, beside FILE.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Bodies for tests: moving skeletons with known truth, in the messages that carry them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Writes BVH files as programs of motion capture do, for tests: none of theirs is in the repository."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The simulated tracker knows who is who, so each observation's person is known. T
 order and without ids.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A camera that is none: a depthai pipeline on this machine alone, which gives what an OAK's own nodes would give."""
 
-from __future__ import annotations
-
 import datetime
 import os
 import threading

@@ -1,7 +1,5 @@
 """A client of Foxglove's WebSocket, as far as tests need one."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

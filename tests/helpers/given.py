@@ -1,7 +1,5 @@
 """A live source that a test gives its frames."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 
 from steadypose.msgs.types import PoseRaw

@@ -1,7 +1,5 @@
 """Motion capture of a leg or an arm, in files as small as can be: what readers are tried on, whole and damaged."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """A file as `steadypose prepare` writes it, of motion made by a test."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

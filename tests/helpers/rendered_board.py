@@ -3,8 +3,6 @@
 Perspective and lens distortion by following every pixel's ray, four rays a pixel; then blur, uneven light and noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

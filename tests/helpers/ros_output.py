@@ -1,7 +1,5 @@
 """An output of the bridge's topics that keeps what is sent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from steadypose.nodes.ros2.definitions import deserialise

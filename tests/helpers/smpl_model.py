@@ -1,7 +1,5 @@
 """A model file of SMPL's form, made of random numbers: a real one is licensed."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,8 +1,6 @@
 """A made-up person who walks in a circle, as every topic would tell it: no motion capture, no model, no noise source
 but a seeded generator."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Real sockets: what a reliable subscriber has not taken, its heir is given; who never reads stops nobody for ever."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A subscriber needs `steadypose.msgs` alone: light to import, of few packages, and without torch."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What the tests of the nodes share: a clock that does not wait, streams made up on the spot, models of noise."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Behind a counter, where no sensor sees legs: of feet nothing is invented, in no form in which poses go out."""
 
-from __future__ import annotations
-
 import json
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Frame by frame: the same numbers as the nodes' pipelines and `clean`, bodies by number, joints by name."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

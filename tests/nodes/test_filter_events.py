@@ -1,7 +1,5 @@
 """Events frame by frame are those of the whole recording, each when it begins, holds and ends."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pipeline on arrays is what ``steadypose clean`` does."""
 
-from __future__ import annotations
-
 import csv
 import re
 import warnings

@@ -1,7 +1,5 @@
 """Mistakes of somebody who uses the library, or the command, for the first time: each is answered with what to do."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable

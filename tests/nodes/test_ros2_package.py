@@ -1,7 +1,5 @@
 """`ros2/steadypose_ros`: its node in a ROS graph, driven by the services of a lifecycle, starts the real program."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -3,8 +3,6 @@
 That is ROS 1's package, for the system's Python, from which ROS 2's `tf2::BufferCore` was ported.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Callable, Iterator

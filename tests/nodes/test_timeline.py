@@ -1,7 +1,5 @@
 """Each event of a stream is listed once, with its begin and end."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

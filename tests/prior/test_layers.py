@@ -1,7 +1,5 @@
 """Imports run one way: no circle of modules, no circle of rooms, and rooms import downwards only."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Mapping
 from functools import cache

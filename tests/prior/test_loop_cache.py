@@ -1,7 +1,5 @@
 """Compiled loops on disk: found again, and compiled anew whatever became of the files."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

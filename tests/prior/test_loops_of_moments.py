@@ -1,7 +1,5 @@
 """Compiled loops against the same written as array expressions, whichever joints are missing."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Medians, of arrays and in loops, are numpy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -3,8 +3,6 @@
 And the number of loops that the progress of compiling counts to is theirs.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

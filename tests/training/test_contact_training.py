@@ -1,7 +1,5 @@
 """Training the contact network: it learns what stands, resumes, and writes what the pipeline loads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

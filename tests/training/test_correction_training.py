@@ -1,7 +1,5 @@
 """What a sensor's correction is trained on, and that it learns it of whoever is there, left as right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

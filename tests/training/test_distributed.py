@@ -1,7 +1,5 @@
 """Training by torchrun: two real processes, against the sum done by hand in this one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Encoders and priors are made constant, so that the KL and its derivative are kno
 different deviations, so that the reverse divergence is another number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

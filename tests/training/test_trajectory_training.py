@@ -1,7 +1,5 @@
 """Training the trajectory network: what it is shown, how its errors are measured, and that what it writes loads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

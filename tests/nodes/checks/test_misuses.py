@@ -1,7 +1,5 @@
 """What goes wrong at a user's is named within three seconds, with what to do: the table of docs/troubleshooting.md."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """`steadypose clean DIR OUT`: all of a folder, many at once, and what is left of it after a stop."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """``steadypose calibrate`` from pictures on disk to a launch file that sends calibrated poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

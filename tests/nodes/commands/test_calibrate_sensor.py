@@ -1,7 +1,5 @@
 """``steadypose calibrate sensor``: a sensor's own error is learned from recordings beside a reference."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

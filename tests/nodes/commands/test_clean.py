@@ -1,7 +1,5 @@
 """`steadypose clean`: what it writes, and at which stamps."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

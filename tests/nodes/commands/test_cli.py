@@ -1,7 +1,5 @@
 """The command: what it lists, what it imports, and how it fails."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from importlib.util import find_spec

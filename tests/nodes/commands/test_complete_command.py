@@ -1,7 +1,5 @@
 """`steadypose complete`: what it fills in, what it leaves, and what it says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

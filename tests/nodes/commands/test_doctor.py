@@ -1,7 +1,5 @@
 """The doctor: what is found on a machine that lacks something, and the exit status."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import subprocess
 import sys

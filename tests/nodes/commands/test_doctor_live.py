@@ -1,7 +1,5 @@
 """The doctor listens to a tracker that publishes, over a real socket."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

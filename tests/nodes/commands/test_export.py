@@ -1,7 +1,5 @@
 """`steadypose export`: what is written is read back by other programs' libraries, where the body was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

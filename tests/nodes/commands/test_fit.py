@@ -1,7 +1,5 @@
 """`steadypose fit`: what it writes for recordings, arrays and key points, and what it says of what it cannot do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Whoever means to change the output writes the file anew, from the repository's r
 worth: ``python -m tests.nodes.commands.test_golden``.
 """
 
-from __future__ import annotations
-
 from itertools import islice
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """echo, hz and info: on recordings, and on topics over real sockets."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import threading

@@ -1,7 +1,5 @@
 """The service that is installed: what it may touch, what is refused beforehand, and what is done and undone."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The picture of a recording: what is read for it, and that it is drawn whatever the recording has."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Skeletons over the video that they were found in. The tests' camera has the field of view that `clean` assumes."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `clean` writes, everything reads: arrays and CSV through `plot`, `info`, `complete` and `clean` itself."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A damaged recording: what is lost is said, the rest is cleaned, or saved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

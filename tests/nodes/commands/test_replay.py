@@ -1,7 +1,5 @@
 """The nodes over real sockets, and `clean` without any: the same stream gives the same messages, every time."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path

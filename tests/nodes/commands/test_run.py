@@ -1,7 +1,5 @@
 """Processes watched and started again, and what a run says of its nodes, and when it is over."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any

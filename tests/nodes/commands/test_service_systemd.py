@@ -5,8 +5,6 @@ As root, with STEADYPOSE_SYSTEMD=1: it takes two minutes. This systemd knows the
 systems of its own at /run, /tmp, /var/tmp and /var/log, so that nothing of the machine's is started, or cleaned up.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

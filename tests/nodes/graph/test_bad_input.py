@@ -1,8 +1,6 @@
 """Whatever comes in is counted by its cause, the next good frame is answered, what goes out keeps its promises, and one
 bad frame is over within a second."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Callable

@@ -1,8 +1,6 @@
 """What a node publishes that was killed in a lossless replay, and began anew with the context that it is given: poses a
 little off those of one that was not killed, and no worse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from conftest import walk

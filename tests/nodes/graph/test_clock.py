@@ -1,7 +1,5 @@
 """A clock that is set while nodes run: stamps follow it, and no wait, rate or restart does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """The events node: what is sent when, and to whom the sensor belongs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, cycle

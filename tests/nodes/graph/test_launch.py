@@ -1,7 +1,5 @@
 """Launch files are read strictly, and say what to write instead."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Counts go on over restarts, and what was published for a node that was away is a loss."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

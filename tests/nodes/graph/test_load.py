@@ -1,7 +1,5 @@
 """Under load: the newest first, fewer bodies before fewer frames, and nothing forgotten because of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Real processes, broken on purpose: what is killed, stopped or in the way comes back, and nothing else stops."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

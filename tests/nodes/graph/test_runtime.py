@@ -1,7 +1,5 @@
 """What every node does: take, give, wait for its subscribers, count what went wrong, and say so."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

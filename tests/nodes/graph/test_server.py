@@ -1,7 +1,5 @@
 """One server for several kiosks, over real sockets: each hears its own, by its own clock."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import defaultdict
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Starting and stopping: a second time, beside another, on a full disk, and whatever asks for the end."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

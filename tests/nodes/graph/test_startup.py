@@ -1,7 +1,5 @@
 """What the start of a node takes, and leaves behind; and what an installation compiles is what the nodes run."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

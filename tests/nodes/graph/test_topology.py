@@ -1,8 +1,6 @@
 """The declarations of the nodes and of the sources name what exists, and agree with each other; and those of another
 package, named in a launch file."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Foxglove's WebSocket: what a client is offered, and gets."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable
 

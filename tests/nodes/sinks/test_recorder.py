@@ -1,7 +1,5 @@
 """A recorder on a disk that fills: what it drops is counted, and what it wrote is whole."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """REP-155: frames where the joints are, and angles that put the URDF's links there."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np

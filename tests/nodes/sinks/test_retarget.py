@@ -1,7 +1,5 @@
 """A robot does as a person does, within its limits, and its feet stand; what is wrong with a URDF is said."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Callable

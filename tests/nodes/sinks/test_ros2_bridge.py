@@ -1,7 +1,5 @@
 """The ROS 2 bridge, heard by a real ROS 2 node (Jazzy's rclpy) in another process, and by a plain DDS one."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -3,8 +3,6 @@
 `.ci/ros2-msgs` builds it.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """The viewer: what is drawn of a message, and the server that shows it."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import itertools
@@ -261,7 +259,7 @@ class Server:
 
     def __init__(self, port: int, host: str) -> None: ...
 
-    def __enter__(self) -> Server:
+    def __enter__(self) -> Any:
         return self
 
     def __exit__(self, *_: object) -> None: ...

@@ -1,7 +1,5 @@
 """The viewer's page in a headless Chromium: what it draws, and whom it calls."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import time

@@ -3,8 +3,6 @@
 No package registry has RViz 2, nor Foxglove's app, so what they ask for is read from their files.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

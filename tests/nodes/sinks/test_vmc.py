@@ -1,7 +1,5 @@
 """The VMC sink: what a program that plays an avatar receives, decoded by the OSC library, gives the body back."""
 
-from __future__ import annotations
-
 import dataclasses
 import socket
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The web sink at its socket: who is served, what is said, and what becomes of who is slow."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import stat

@@ -1,7 +1,5 @@
 """The web page and the kiosk's in a headless Chromium: what they draw and say, and whom they call."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import shutil

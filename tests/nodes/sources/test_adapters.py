@@ -1,7 +1,5 @@
 """Messages of other trackers, made up as they give them, and what becomes of them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace as Made
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CSV files of poses: what they may say, what comes of it, and what is told of those that hold none."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The OAK camera's part on this machine, driven by real depthai pipelines without a camera: skeletons, and an image for
 its calibration."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

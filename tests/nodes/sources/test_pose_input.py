@@ -1,7 +1,5 @@
 """The input node keeps the pace of the capture, on a clock that does not wait."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace

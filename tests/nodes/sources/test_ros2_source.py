@@ -1,7 +1,5 @@
 """Skeletons from ROS 2 topics, published by a real ROS 2 node in another process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What docs/sources.md prints runs as it is printed."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """A sensor's pose from TF: the buffer against matrices, and a source whose messages wait for their transform."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Two cameras to one source of bodies in the world, over real sockets."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A webcam: real video through OpenCV, with a landmarker in MediaPipe's place that sees a person in every image."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """Skeletons of motion files, recognised: each family as its program cuts a body, written and read back."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The level of a camera from its accelerometer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

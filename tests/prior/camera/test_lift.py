@@ -1,7 +1,5 @@
 """Key points lifted by depth: flat people of which the answer is known, and simulated ones filmed by stereo."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import cv2

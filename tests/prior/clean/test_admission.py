@@ -1,7 +1,5 @@
 """One wrong stamp is dropped; a jump that lasts costs nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from typing import Any

@@ -1,7 +1,5 @@
 """What the deviations leave out of a sensor's error is read from bones, in whatever direction it errs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """What is fused of smoother, completion and bones, in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.helpers.bodies import waving

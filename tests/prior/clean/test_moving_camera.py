@@ -1,7 +1,5 @@
 """A camera that pans and drives, with its pose in every message, finds people as one that stands still does."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

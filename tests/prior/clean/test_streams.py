@@ -1,7 +1,5 @@
 """Many streams in one prior: each gets what it would get alone, whatever its clock, and whoever fails beside it."""
 
-from __future__ import annotations
-
 import dataclasses
 import heapq
 

@@ -1,7 +1,5 @@
 """Deviations of parts of the body of which no joint was ever observed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from steadypose.prior.body.skeleton import J

@@ -1,7 +1,5 @@
 """Completing whole recordings: what is known stays, nothing is left out, and windows leave no seams."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

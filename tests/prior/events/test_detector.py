@@ -1,7 +1,5 @@
 """Each event begins when a body does that, and no sooner, no later, and not when its joints are too uncertain."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable
 

@@ -1,7 +1,5 @@
 """Bodies of a cleaned stream: what of them is fitted, when a fit has failed, and the messages with fitted poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """What each term of the energy is worth, in closed form: nats of motions whose residuals are known by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

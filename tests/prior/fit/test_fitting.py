@@ -1,7 +1,5 @@
 """Fits of simulated people, with the weights that ship."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

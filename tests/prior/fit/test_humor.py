@@ -1,7 +1,5 @@
 """HuMoR's transition model: frames, steps and rollouts against plain references, training, and what ships."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

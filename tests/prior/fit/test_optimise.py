@@ -1,7 +1,5 @@
 """The search through HM-VAE (section 4): it finds what fits, keeps it, and changes no model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

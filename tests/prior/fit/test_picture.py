@@ -1,7 +1,5 @@
 """Fits to key points of an image: where they start, what they are to meet, and what is written of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

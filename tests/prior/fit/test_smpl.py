@@ -1,7 +1,5 @@
 """SMPL's motion of a fit, with a model of SMPL's form that is made here: a real one is licensed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Rotations, kinematics and motions with gradients, against those without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

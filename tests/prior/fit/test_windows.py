@@ -1,7 +1,5 @@
 """Windows of a long track: how they are joined, told apart and read; what of a body and its messages is fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """The completer: the line that it corrects, both of its forms, and its training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The contact network: what it reads, that its live form says the same, and what the shipped weights are worth."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The live forms of the small networks are the trained ones: random weights, random inputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The mixture: the live form against torch, and what must hold of its answers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

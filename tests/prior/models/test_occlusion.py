@@ -1,7 +1,5 @@
 """Occluded joints: what is said of them against naive references, and the network that weighs it against torch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

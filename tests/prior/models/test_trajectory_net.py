@@ -1,7 +1,5 @@
 """The trajectory network's live form predicts what was trained, frame by frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

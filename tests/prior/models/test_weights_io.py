@@ -1,7 +1,5 @@
 """Weights are refused by what is wrong with the file, not by where a network first stumbles."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

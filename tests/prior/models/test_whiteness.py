@@ -1,7 +1,5 @@
 """Whiteness of noise is read from bones, so that it is that of the sensor and not of the motion."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

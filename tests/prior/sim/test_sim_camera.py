@@ -1,7 +1,5 @@
 """The simulated camera: who is hidden, who is in view, and where the joints are said to be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

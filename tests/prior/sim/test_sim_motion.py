@@ -1,7 +1,5 @@
 """Scripted motions: feet that stay, bones that keep their lengths, a plausible gait."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The noise model: what its parameters promise, and that it is like the Kinect it was fitted to."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

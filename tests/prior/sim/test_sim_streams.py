@@ -1,7 +1,5 @@
 """The manifest, and the recordings made from it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bodies as they are published: legs on their bones, the rotations that go with them, deviations and tracking."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

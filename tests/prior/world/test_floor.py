@@ -1,7 +1,5 @@
 """The floor found from standing feet."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

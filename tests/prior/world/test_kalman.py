@@ -1,7 +1,5 @@
 """The body filter against a textbook Kalman filter, and what feet at rest do to it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

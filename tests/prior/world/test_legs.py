@@ -1,7 +1,5 @@
 """Which joints of legs are only guesses, by how long they have been unobserved."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bodies as observed in the world, and what the networks read and say of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Sitting, lying and climbing: no ground where there is none, and nobody is worse off for a floor that is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

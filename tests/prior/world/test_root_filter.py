@@ -1,7 +1,5 @@
 """Which observations and predictions the filter of root and feet uses, and how much it trusts each."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any, cast
 

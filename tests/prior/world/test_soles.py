@@ -1,7 +1,5 @@
 """What a floor says of the heights of feet, against integrals over all heights, and where it must say nothing."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Feet that stand are published still, and never far from where they are estimated; a root that sways, slowly."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The trajectory pipeline with the weights that ship, on motion made here: no recording goes in."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

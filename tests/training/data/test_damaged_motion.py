@@ -1,7 +1,5 @@
 """Damaged motion capture: the reader says so in its own words, and the other recordings are prepared."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -1,7 +1,5 @@
 """From files to clips: archives and folders, families of skeletons, and the splits."""
 
-from __future__ import annotations
-
 import io
 import tarfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of motion of other kinds than BVH: points by their names, TRC, C3D, arrays; and from any folder."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Joint centres from markers put on a body whose joints are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Preparation: resampling, gaps, the floor, what is refused, and the file that comes out."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace

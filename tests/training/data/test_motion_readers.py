@@ -1,7 +1,5 @@
 """Readers of motion capture against kinematics written out by hand, joint by joint and frame by frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """UI-PRMD's archive: units, axes, order, and what is missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
