@@ -27,15 +27,12 @@ Parameters = dict[str, float]
 
 @dataclass(frozen=True)
 class Tuned:
-    """Result of a parameter search.
-
-    Attributes:
-        parameters: parameters with the least loss.
-        tried: every evaluated point, with its figures.
-    """
+    """Result of a parameter search."""
 
     parameters: Parameters
+    """parameters with the least loss"""
     tried: list[dict[str, float]]
+    """every evaluated point, with its figures"""
 
 
 def loss(figures: Mapping[str, float]) -> float:
@@ -84,21 +81,18 @@ RECURRENT = "GRU of the whole body"
 
 @dataclass(frozen=True)
 class Bench:
-    """Settings of a study.
-
-    Attributes:
-        quick: use fewer clips, points and steps, to check that everything works.
-        split: split of the prepared motion to score: ``val`` to choose, ``test`` to report.
-        mocap: folder with ui_prmd.npz, or None.
-        data: prepared.npz; if it does not exist, simulated people are used instead.
-        progress: progress bars.
-    """
+    """Settings of a study."""
 
     quick: bool
+    """use fewer clips, points and steps, to check that everything works"""
     mocap: Path | None
+    """folder with ui_prmd.npz, or None"""
     data: Path
+    """prepared.npz; if it does not exist, simulated people are used instead"""
     progress: Progress
+    """progress bars"""
     split: str = "val"
+    """split of the prepared motion to score: ``val`` to choose, ``test`` to report"""
 
     @property
     def delays(self) -> tuple[int, ...]:
@@ -155,19 +149,16 @@ class Answer(NamedTuple):
 
 
 class Methods(NamedTuple):
-    """Methods to compare.
-
-    Attributes:
-        baselines: baselines without training.
-        product: steadypose's variants.
-        delays: frames.
-        networks: whether to include the baselines trained here.
-    """
+    """Methods to compare."""
 
     baselines: Sequence[Baseline]
+    """baselines without training"""
     product: Mapping[str, PriorSettings]
+    """steadypose's variants"""
     delays: Sequence[int]
+    """frames"""
     networks: bool = True
+    """whether to include the baselines trained here"""
 
     @classmethod
     def all(cls, bench: Bench, baselines: Sequence[Baseline] = BASELINES) -> Methods:

@@ -48,23 +48,20 @@ imputed."""
 
 @dataclass(frozen=True)
 class Cleaned:
-    """The content of ``pose/clean``.
-
-    Attributes:
-        stamps_s: (T',) seconds, on the prior's 30 Hz grid.
-        positions: (T', C, 22, 3) metres; NaN without an estimate.
-        sigma: (T', C, 22) metres, the predicted standard deviation along an axis.
-        anomaly: (T', C) score, NaN without an estimate.
-        flagged: (T', C) whether it was flagged as an anomaly.
-        rotations: (T', C, 22, 4) local, xyzw.
-    """
+    """The content of ``pose/clean``."""
 
     stamps_s: Floats
+    """(T',) seconds, on the prior's 30 Hz grid"""
     positions: Floats
+    """(T', C, 22, 3) metres; NaN without an estimate"""
     sigma: Floats
+    """(T', C, 22) metres, the predicted standard deviation along an axis"""
     anomaly: Floats
+    """(T', C) score, NaN without an estimate"""
     flagged: NDArray[np.bool_]
+    """(T', C) whether it was flagged as an anomaly"""
     rotations: Floats
+    """(T', C, 22, 4) local, xyzw"""
 
 
 @lru_cache(maxsize=64)

@@ -31,38 +31,32 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a result. The first column is text, the others are figures.
-
-    Attributes:
-        name: name in the markers between which the table is written.
-        title: what is measured, with units.
-        columns: headers.
-        rows: cells, ready to print.
-        note: conditions that a reader must know.
-    """
+    """A table of a result. The first column is text, the others are figures."""
 
     name: str
+    """name in the markers between which the table is written"""
     title: str
+    """what is measured, with units"""
     columns: list[str]
+    """headers"""
     rows: list[list[str]]
+    """cells, ready to print"""
     note: str = ""
+    """conditions that a reader must know"""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a study.
-
-    Attributes:
-        tables: tables to read; the first is printed first.
-        data: figures for programs.
-        figures: plots by file name.
-        wrong: violated requirements, a line each; the command then fails.
-    """
+    """Result of a study."""
 
     tables: list[Table]
+    """tables to read; the first is printed first"""
     data: dict[str, Any]
+    """figures for programs"""
     figures: Mapping[str, Figure] = field(default_factory=dict)
+    """plots by file name"""
     wrong: Sequence[str] = ()
+    """violated requirements, a line each; the command then fails"""
 
 
 class Study(Protocol):

@@ -102,17 +102,14 @@ WRAP = 2**32
 
 @dataclass(eq=False)
 class _Progress:
-    """Progress of a subscriber.
-
-    Attributes:
-        following: by topic, the sequence number of the next message to be acknowledged.
-        context: number of acknowledged messages that it requests if it restarts.
-        sign_s: time of its last sign of life, or since which it has unread messages, monotonic seconds.
-    """
+    """Progress of a subscriber."""
 
     following: dict[str, int]
+    """by topic, the sequence number of the next message to be acknowledged"""
     context: int
+    """number of acknowledged messages that it requests if it restarts"""
     sign_s: float
+    """time of its last sign of life, or since which it has unread messages, monotonic seconds"""
 
     def silent_s(self, sequence: Mapping[str, int]) -> float:
         """Time for which it has had unread messages without a sign of life, seconds."""

@@ -35,23 +35,20 @@ Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Options of ``steadypose train``, common to all models.
-
-    Attributes:
-        data: ``prepared.npz``, or other training data of the model.
-        runs: folder of training runs; an interrupted run of the same name resumes there.
-        weights: the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name.
-        iterations: number of optimiser steps, at least 1; None for the model's default.
-        seed: random seed of initial weights and of sampling.
-        start: weights to start from: a weight set or a path.
-    """
+    """Options of ``steadypose train``, common to all models."""
 
     data: Path
+    """``prepared.npz``, or other training data of the model"""
     runs: Path
+    """folder of training runs; an interrupted run of the same name resumes there"""
     weights: str = "default"
+    """the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name"""
     iterations: int | None = None
+    """number of optimiser steps, at least 1; None for the model's default"""
     seed: int = 0
+    """random seed of initial weights and of sampling"""
     start: str | None = None
+    """weights to start from: a weight set or a path"""
 
     def __post_init__(self) -> None:
         if self.iterations is not None and self.iterations < 1:
@@ -70,45 +67,41 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class Recipe(Generic[Network]):
-    """The model-specific part of a training.
-
-    Attributes:
-        model: the model's name.
-        network: creates the untrained network.
-        loss: returns the loss of a random batch, and terms to plot. It is called with the network in training mode, the
-            number of samples, the progress of the training in [0, 1), and a random generator, which differs between
-            torchrun's processes.
-        evaluate: returns further quantities to plot, on validation data; called in evaluation mode, without gradients.
-        iterations: default number of optimiser steps.
-        batch: samples per step, of all processes together.
-        rate: initial learning rate.
-        sample: name of a sample, in the plural.
-        decay: weight decay.
-        optimiser: AdamW, or Adam where a paper uses it.
-        schedule: creates the learning rate schedule from the optimiser and the number of steps; by default, a cosine
-            down to a hundredth.
-        evaluations: number of evaluations and checkpoints.
-        clip: maximum norm of the gradient.
-        parameters: the network's trained parameters; all by default.
-        average: decay of the exponential moving average of the parameters; if given, the average is evaluated and
-            saved.
-    """
+    """The model-specific part of a training."""
 
     model: str
+    """the model's name"""
     network: Callable[[], Network]
+    """creates the untrained network"""
     loss: Callable[[Network, int, float, Rng], tuple[Tensor, dict[str, float]]]
+    """returns the loss of a random batch, and terms to plot. It is called with the network in training mode, the number
+    of samples, the progress of the training in [0, 1), and a random generator, which differs between torchrun's
+    processes"""
     evaluate: Callable[[Network], dict[str, float]]
+    """returns further quantities to plot, on validation data; called in evaluation mode, without gradients"""
     iterations: int
+    """default number of optimiser steps"""
     batch: int
+    """samples per step, of all processes together"""
     rate: float
+    """initial learning rate"""
     sample: str = "windows"
+    """name of a sample, in the plural"""
     decay: float = 0.0
+    """weight decay"""
     optimiser: type[Adam] = AdamW
+    """AdamW, or Adam where a paper uses it"""
     schedule: Callable[[Optimizer, int], LRScheduler] | None = None
+    """creates the learning rate schedule from the optimiser and the number of steps; by default, a cosine down to a
+    hundredth"""
     evaluations: int = 40
+    """number of evaluations and checkpoints"""
     clip: float = 1.0
+    """maximum norm of the gradient"""
     parameters: Callable[[Network], list[nn.Parameter]] | None = None
+    """the network's trained parameters; all by default"""
     average: float | None = None
+    """decay of the exponential moving average of the parameters; if given, the average is evaluated and saved"""
 
     def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
         """Train ``network`` in place, in the folder of a run; resumes a checkpoint there."""

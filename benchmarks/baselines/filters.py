@@ -33,21 +33,18 @@ _MEASUREMENT_SIGMA = 0.02  # metres, as in `fixed_lag`
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method and the range of its parameters.
-
-    Attributes:
-        name: name in tables.
-        run: maps (seen, stamps_s, delay, **parameters) to estimates of seen's shape.
-        delays: supported delays; None for any.
-        space: range of each parameter, searched evenly in its logarithm.
-        whole_body: whether it needs all 22 canonical joints.
-    """
+    """A method and the range of its parameters."""
 
     name: str
+    """name in tables"""
     run: Callable[..., Floats]
+    """maps (seen, stamps_s, delay, **parameters) to estimates of seen's shape"""
     delays: tuple[int, ...] | None = None
+    """supported delays; None for any"""
     space: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """range of each parameter, searched evenly in its logarithm"""
     whole_body: bool = False
+    """whether it needs all 22 canonical joints"""
 
 
 def missing(seen: Floats) -> NDArray[np.bool_]:

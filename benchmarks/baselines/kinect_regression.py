@@ -37,18 +37,15 @@ _CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A smoothed clip.
-
-    Attributes:
-        inputs: (T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part of the
-            delay that the regression does not look ahead itself.
-        answer: (T, 13, 3) metres, the scored joints, smoothed with the whole delay.
-        trunk: (T, 3, 3) the trunk's frame in that of the answer.
-    """
+    """A smoothed clip."""
 
     inputs: Floats
+    """(T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part of the delay
+    that the regression does not look ahead itself"""
     answer: Floats
+    """(T, 13, 3) metres, the scored joints, smoothed with the whole delay"""
     trunk: Floats
+    """(T, 3, 3) the trunk's frame in that of the answer"""
 
     def corrected(self, missing: Floats) -> Floats:
         """Add a correction (T, 39) in the trunk's frame to the smoothed joints, (T, 13, 3)."""

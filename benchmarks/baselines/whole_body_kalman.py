@@ -27,15 +27,12 @@ FIRST_PLACE, FIRST_SPEED = 1.0, 1.0
 
 
 class WholeBody(NamedTuple):
-    """State of S bodies.
-
-    Attributes:
-        mean: (S, 44, 3) positions in metres, then velocities in m/s; positions are NaN before a first measurement.
-        covariance: (S, 44, 44) the same for each axis.
-    """
+    """State of S bodies."""
 
     mean: Floats
+    """(S, 44, 3) positions in metres, then velocities in m/s; positions are NaN before a first measurement"""
     covariance: Floats
+    """(S, 44, 44) the same for each axis"""
 
 
 def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float, damping: float) -> Floats:

@@ -45,17 +45,14 @@ SWING_NOISES_M = (0.0, 0.01)
 
 
 class Swing(NamedTuple):
-    """A limb that swings about a joint.
-
-    Attributes:
-        pivot: the joint that rotates.
-        moves: the joints below it.
-        axis: axis of rotation in the frame of the bone above, which in the rest pose has x forward and z up.
-    """
+    """A limb that swings about a joint."""
 
     pivot: str
+    """the joint that rotates"""
     moves: tuple[str, ...]
+    """the joints below it"""
     axis: tuple[float, float, float]
+    """axis of rotation in the frame of the bone above, which in the rest pose has x forward and z up"""
 
 
 SWINGS = {

@@ -45,19 +45,16 @@ class Stated(NamedTuple):
 
 @dataclass(frozen=True)
 class Method:
-    """A method to clean clips, at one delay.
-
-    Attributes:
-        name: name in tables.
-        delay: frames.
-        run: maps clips to (T, 13, 3) metres each, and steadypose's further output for them.
-        parameters: tuned parameters.
-    """
+    """A method to clean clips, at one delay."""
 
     name: str
+    """name in tables"""
     delay: int
+    """frames"""
     run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
+    """maps clips to (T, 13, 3) metres each, and steadypose's further output for them"""
     parameters: Mapping[str, float] = field(default_factory=dict)
+    """tuned parameters"""
 
 
 def run_filter(
@@ -93,19 +90,16 @@ def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tupl
 
 @dataclass
 class Kinect:
-    """The methods, with each person left out in turn. What does not depend on the person is computed once.
-
-    Attributes:
-        bench: settings of the study.
-        data: ``ui_prmd.npz``.
-        clips: clips of all people.
-        taught: clips of all people from which baselines learn.
-    """
+    """The methods, with each person left out in turn. What does not depend on the person is computed once."""
 
     bench: Bench
+    """settings of the study"""
     data: Path
+    """``ui_prmd.npz``"""
     clips: Sequence[Clip]
+    """clips of all people"""
     taught: Sequence[Clip]
+    """clips of all people from which baselines learn"""
     _answers: dict[tuple[str | float, ...], dict[str, tuple[Floats, Stated | None]]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:

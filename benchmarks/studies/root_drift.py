@@ -33,17 +33,14 @@ HORIZONS = (15, 30, 60)
 
 
 class Way(NamedTuple):
-    """Output of a method, in the world.
-
-    Attributes:
-        positions: (T, 22, 3) metres.
-        velocity: (T, 3) m/s, the root's.
-        sigma: (T, 3) metres, the root's standard deviation.
-    """
+    """Output of a method, in the world."""
 
     positions: Floats
+    """(T, 22, 3) metres"""
     velocity: Floats
+    """(T, 3) m/s, the root's"""
     sigma: Floats
+    """(T, 3) metres, the root's standard deviation"""
 
 
 Method = Callable[[Sequence[PoseClean]], Way]
@@ -71,17 +68,14 @@ METHODS: Mapping[str, Method] = {
 
 @dataclass(frozen=True)
 class Clip:
-    """True motion at 30 Hz.
-
-    Attributes:
-        positions: (T, 22, 3) metres, world, floor at 0.
-        rotations: (T, 22, 4) xyzw, local.
-        contacts: (T, 8) labels.
-    """
+    """True motion at 30 Hz."""
 
     positions: Floats
+    """(T, 22, 3) metres, world, floor at 0"""
     rotations: Floats
+    """(T, 22, 4) xyzw, local"""
     contacts: NDArray[np.bool_]
+    """(T, 8) labels"""
 
     @property
     def hidden(self) -> NDArray[np.bool_]:

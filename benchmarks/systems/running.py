@@ -27,22 +27,19 @@ SILENCE_S = 30.0
 
 
 class Running(NamedTuple):
-    """Running nodes.
-
-    Attributes:
-        messages: what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it arrives; ends when a node
-            fails or all fall silent.
-        subscriber: source of ``messages``, for callers who do not want to wait for them.
-        supervisor: the supervisor of their processes.
-        clock: their clock.
-        endpoints: where they publish.
-    """
+    """Running nodes."""
 
     messages: Iterator[tuple[str, Message]]
+    """what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it arrives; ends when a node fails or
+    all fall silent"""
     subscriber: Subscriber
+    """source of ``messages``, for callers who do not want to wait for them"""
     supervisor: Supervisor
+    """the supervisor of their processes"""
     clock: SystemClock
+    """their clock"""
     endpoints: list[str]
+    """where they publish"""
 
 
 @contextmanager

@@ -20,17 +20,14 @@ PREFIX = "problem."
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem with a stream.
-
-    Attributes:
-        level: ERROR if no useful output is possible, WARN if the output is worse than it could be.
-        cause: one word; docs/troubleshooting.md has an entry for each.
-        text: what was received, what was expected, and what to do.
-    """
+    """A problem with a stream."""
 
     level: Level
+    """ERROR if no useful output is possible, WARN if the output is worse than it could be"""
     cause: str
+    """one word; docs/troubleshooting.md has an entry for each"""
     text: str
+    """what was received, what was expected, and what to do"""
 
 
 def error(cause: str, text: str) -> Problem:

@@ -161,27 +161,24 @@ def plural(count: int, one: str, more: str) -> str:
 
 @dataclass(frozen=True)
 class Cleaned:
-    """Summary of the cleaning of one recording.
-
-    Attributes:
-        frames: of the input.
-        duration_s: of the input; steps of its stamps back do not count.
-        spent_s: computing time.
-        poses: number of poses in the output; 0 if no body was recognised, which is then a problem.
-        refused: what was refused or dropped, by cause.
-        problems: what is wrong with the input, each as it was first found.
-        trusted: whether the output can be trusted in spite of them.
-        unread: what of it the input holds and could not be read, because it is damaged.
-    """
+    """Summary of the cleaning of one recording."""
 
     frames: int
+    """of the input"""
     duration_s: float
+    """of the input; steps of its stamps back do not count"""
     spent_s: float
+    """computing time"""
     poses: int
+    """number of poses in the output; 0 if no body was recognised, which is then a problem"""
     refused: dict[str, int]
+    """what was refused or dropped, by cause"""
     problems: list[str]
+    """what is wrong with the input, each as it was first found"""
     trusted: bool
+    """whether the output can be trusted in spite of them"""
     unread: dict[str, int]
+    """what of it the input holds and could not be read, because it is damaged"""
 
 
 def clean_recording(

@@ -32,21 +32,18 @@ class ExportError(ValueError):
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """A body's motion at a constant frame rate.
-
-    Attributes:
-        fps: frame rate, Hz.
-        root: (T, 3) metres, world, z up: the pelvis.
-        rotations: (T, 22, 4) xyzw, local; the pelvis' to the world.
-        offsets: (22, 3) metres, each joint in its parent's frame.
-        start_s: stamp of the first frame, seconds.
-    """
+    """A body's motion at a constant frame rate."""
 
     fps: float
+    """frame rate, Hz"""
     root: Floats
+    """(T, 3) metres, world, z up: the pelvis"""
     rotations: Floats
+    """(T, 22, 4) xyzw, local; the pelvis' to the world"""
     offsets: Floats
+    """(22, 3) metres, each joint in its parent's frame"""
     start_s: float = 0.0
+    """stamp of the first frame, seconds"""
 
     @property
     def positions(self) -> Floats:

@@ -45,23 +45,20 @@ PARTS = ("pelvis", "torso", *(f"{side}_{part}" for side in _SIDES for part in _P
 
 @dataclass(frozen=True)
 class Robot:
-    """A humanoid robot.
-
-    Attributes:
-        model: MuJoCo's model, with a free joint under the root link.
-        joints: (N,) names of the moving joints, in the model's order.
-        lower: (N,) lower limits from the URDF, radians or metres.
-        upper: (N,) upper limits from the URDF, radians or metres.
-        speed: (N,) largest speeds, rad/s or m/s.
-        links: link of each part in `PARTS`.
-    """
+    """A humanoid robot."""
 
     model: mujoco.MjModel
+    """MuJoCo's model, with a free joint under the root link"""
     joints: tuple[str, ...]
+    """(N,) names of the moving joints, in the model's order"""
     lower: NDArray[np.float64]
+    """(N,) lower limits from the URDF, radians or metres"""
     upper: NDArray[np.float64]
+    """(N,) upper limits from the URDF, radians or metres"""
     speed: NDArray[np.float64]
+    """(N,) largest speeds, rad/s or m/s"""
     links: Mapping[str, str]
+    """link of each part in `PARTS`"""
 
 
 def load_robot(path: Path, links: Mapping[str, str]) -> Robot:

@@ -318,19 +318,16 @@ READING_TIMEOUT_S = 1.0
 
 @dataclass(frozen=True)
 class Still:
-    """A still image of a camera, with depth.
-
-    Attributes:
-        colour: (H, W, 3) BGR, undistorted.
-        depth: (H, W) millimetres, in the view of ``colour``; 0 in holes.
-        intrinsics: (3, 3) of both.
-        up: (3,) direction of up measured by the IMU, optical frame; None without a calibrated IMU.
-    """
+    """A still image of a camera, with depth."""
 
     colour: NDArray[np.uint8]
+    """(H, W, 3) BGR, undistorted"""
     depth: NDArray[np.uint16]
+    """(H, W) millimetres, in the view of ``colour``; 0 in holes"""
     intrinsics: NDArray[np.float64]
+    """(3, 3) of both"""
     up: NDArray[np.float64] | None
+    """(3,) direction of up measured by the IMU, optical frame; None without a calibrated IMU"""
 
 
 class Pairs(dai.node.HostNode):

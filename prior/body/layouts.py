@@ -55,19 +55,16 @@ NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A sensor's joints and their mapping to the canonical joints.
-
-    Attributes:
-        name: the name that messages and files use.
-        joints: the sensor's joint names, in the sensor's order.
-        table: canonical joint -> sensor joint, or sensor joints with weights (normalised to sum to 1).
-        interpolated: canonical joints that are only about where the table has them.
-    """
+    """A sensor's joints and their mapping to the canonical joints."""
 
     name: str
+    """the name that messages and files use"""
     joints: tuple[str, ...]
+    """the sensor's joint names, in the sensor's order"""
     table: Mapping[str, str | Mapping[str, float]]
+    """canonical joint -> sensor joint, or sensor joints with weights (normalised to sum to 1)"""
     interpolated: frozenset[str] = frozenset()
+    """canonical joints that are only about where the table has them"""
 
     def index(self, joint: str) -> int:
         """Index of a sensor joint by name.

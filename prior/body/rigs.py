@@ -60,20 +60,17 @@ class RigError(ValueError):
 
 @dataclass(frozen=True)
 class Rig:
-    """The mapping from a motion file's skeleton to the canonical one.
-
-    Attributes:
-        skeleton: the file's joints that are used, and their table.
-        metres: the file's unit, metres.
-        lost_bones: joints whose OFFSET is zero because a converter lost it, each with the bone's length as a multiple
-            of its parent's OFFSET, whose direction it shares.
-        up: the file's axis that points up: ``y``, ``-y`` or ``z``; empty if the motion determines it.
-    """
+    """The mapping from a motion file's skeleton to the canonical one."""
 
     skeleton: Skeleton
+    """the file's joints that are used, and their table"""
     metres: float
+    """the file's unit, metres"""
     lost_bones: Mapping[str, float] = field(default_factory=dict)
+    """joints whose OFFSET is zero because a converter lost it, each with the bone's length as a multiple of its
+    parent's OFFSET, whose direction it shares"""
     up: str = ""
+    """the file's axis that points up: ``y``, ``-y`` or ``z``; empty if the motion determines it"""
 
 
 def mirror_names(names: Sequence[str]) -> dict[str, str]:
@@ -90,17 +87,14 @@ def mirror_names(names: Sequence[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Tree:
-    """A file's skeleton.
-
-    Attributes:
-        joints: J names, parents first.
-        parents: index of each joint's parent; -1 for a root.
-        offsets: (J, 3) offsets from the parent, in the file's unit.
-    """
+    """A file's skeleton."""
 
     joints: Sequence[str]
+    """J names, parents first"""
     parents: Sequence[int]
+    """index of each joint's parent; -1 for a root"""
     offsets: Floats
+    """(J, 3) offsets from the parent, in the file's unit"""
 
     @cached_property
     def rest(self) -> Floats:

@@ -41,19 +41,16 @@ MAX_BODIES = 16
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """The bodies in one frame of one camera.
-
-    Attributes:
-        stamp_ns: time of capture, nanoseconds.
-        joints: (N, 22, 3) metres, world; NaN where unobserved.
-        confidence: (N, 22), 0 where unobserved.
-        eye: (3,) metres, world: where the camera stands.
-    """
+    """The bodies in one frame of one camera."""
 
     stamp_ns: int
+    """time of capture, nanoseconds"""
     joints: Floats
+    """(N, 22, 3) metres, world; NaN where unobserved"""
     confidence: Floats
+    """(N, 22), 0 where unobserved"""
     eye: Floats
+    """(3,) metres, world: where the camera stands"""
 
 
 class Merge:
@@ -136,17 +133,14 @@ class Merge:
 
 @dataclass(frozen=True)
 class CameraBody:
-    """One body as one camera observes it.
-
-    Attributes:
-        joints: (22, 3) metres, world; NaN where unobserved.
-        confidence: (22,).
-        eye: (3,) metres, world.
-    """
+    """One body as one camera observes it."""
 
     joints: Floats
+    """(22, 3) metres, world; NaN where unobserved"""
     confidence: Floats
+    """(22,)"""
     eye: Floats
+    """(3,) metres, world"""
 
 
 def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:

@@ -32,15 +32,12 @@ _REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
 
 class BodyJoints(NamedTuple):
-    """Joints of a body, or of S bodies by slot.
-
-    Attributes:
-        positions: (22, 3) or (S, 22, 3) metres, z up; NaN where unobserved.
-        confidence: (22,) or (S, 22) in 0..1.
-    """
+    """Joints of a body, or of S bodies by slot."""
 
     positions: Floats
+    """(22, 3) or (S, 22, 3) metres, z up; NaN where unobserved"""
     confidence: Floats
+    """(22,) or (S, 22) in 0..1"""
 
 
 class Lately(deque[PoseRaw]):

@@ -40,15 +40,12 @@ _MIN_VARIANCE = 1e-10
 
 
 class Precision(NamedTuple):
-    """Inverse variances of each joint's position along an axis, 1/m^2, (S, 22).
-
-    Attributes:
-        seen: precision of the smoother.
-        prior: precision of the prior.
-    """
+    """Inverse variances of each joint's position along an axis, 1/m^2, (S, 22)."""
 
     seen: Floats
+    """precision of the smoother"""
     prior: Floats
+    """precision of the prior"""
 
 
 class Fuse:

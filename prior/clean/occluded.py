@@ -59,31 +59,25 @@ FIRST_SPEED = 3.0
 
 
 class Placed(NamedTuple):
-    """N occluded joints.
-
-    Attributes:
-        joints: (N, 2) row of the body, and index of the joint.
-        positions: (N, 3) metres.
-        sigma: (N,) metres, standard deviation along an axis.
-    """
+    """N occluded joints."""
 
     joints: NDArray[np.intp]
+    """(N, 2) row of the body, and index of the joint"""
     positions: Floats
+    """(N, 3) metres"""
     sigma: Floats
+    """(N,) metres, standard deviation along an axis"""
 
 
 class Track(NamedTuple):
-    """The last frames of S bodies, for joints that are observed again within the delay.
-
-    Attributes:
-        positions: (T, S, 22, 3) metres, observations; NaN where unobserved.
-        at: index of the frame to be estimated.
-        noise: (S,) metres along an axis, standard deviation of the observations.
-    """
+    """The last frames of S bodies, for joints that are observed again within the delay."""
 
     positions: Floats
+    """(T, S, 22, 3) metres, observations; NaN where unobserved"""
     at: int
+    """index of the frame to be estimated"""
     noise: Floats
+    """(S,) metres along an axis, standard deviation of the observations"""
 
 
 class OccludedJoints:

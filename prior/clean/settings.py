@@ -18,17 +18,14 @@ lengths must match as well."""
 
 @dataclass(frozen=True)
 class IdentifySettings:
-    """Settings of the identify stage.
-
-    Attributes:
-        enabled: whether to assign ids here and ignore the source's; if off, the source's ids are passed on.
-        birth: seconds for which an unknown body must be observed before it gets an id.
-        death: seconds without an observation after which a person is forgotten. On return, the person gets a new id.
-    """
+    """Settings of the identify stage."""
 
     enabled: bool = False
+    """whether to assign ids here and ignore the source's; if off, the source's ids are passed on"""
     birth: float = 0.25
+    """seconds for which an unknown body must be observed before it gets an id"""
     death: float = 5.0
+    """seconds without an observation after which a person is forgotten. On return, the person gets a new id"""
 
     def __post_init__(self) -> None:
         # a shorter `death` would drop tracks that can still be matched by position
@@ -41,166 +38,129 @@ class IdentifySettings:
 
 @dataclass(frozen=True)
 class GateSettings:
-    """Thresholds of the gate.
-
-    Attributes:
-        enabled: whether to reject outliers; if off, all observed joints pass.
-        jump: metres that a joint may be from its prediction, in addition to three standard deviations of the
-            prediction.
-        patience: seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted.
-        min_confidence: joints of lower confidence count as unobserved.
-    """
+    """Thresholds of the gate."""
 
     enabled: bool = True
+    """whether to reject outliers; if off, all observed joints pass"""
     jump: float = 0.18
+    """metres that a joint may be from its prediction, in addition to three standard deviations of the prediction"""
     patience: float = 0.3
+    """seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted"""
     min_confidence: float = 0.1
+    """joints of lower confidence count as unobserved"""
 
 
 @dataclass(frozen=True)
 class CorrectSettings:
-    """Settings of the correct stage.
-
-    Attributes:
-        sensor: ``kinect_v2``, or empty for a sensor whose error is not known. The error belongs to the sensor, not to
-            its joint layout: another camera with the same joints has other errors.
-    """
+    """Settings of the correct stage."""
 
     sensor: str = weights_setting("correction", default="")
+    """``kinect_v2``, or empty for a sensor whose error is not known. The error belongs to the sensor, not to its joint
+    layout: another camera with the same joints has other errors"""
 
 
 @dataclass(frozen=True)
 class SmoothSettings:
-    """Settings of the smooth stage. There are no noise parameters to tune.
-
-    Attributes:
-        weights: weight set (``default``), or a path to a ``.safetensors`` file.
-    """
+    """Settings of the smooth stage. There are no noise parameters to tune."""
 
     weights: str = weights_setting("mixture")
+    """weight set (``default``), or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)
 class ReconstructSettings:
-    """Settings of the reconstruct stage (``[prior.reconstruct]``).
-
-    Attributes:
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
+    """Settings of the reconstruct stage (``[prior.reconstruct]``)."""
 
     weights: str = weights_setting("hgvae")
+    """weight set (``default``, ``research``) or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)
 class DenoiseSettings:
-    """Settings of the denoise stage.
-
-    Attributes:
-        enabled: whether to denoise; if off, observed joints stay as smoothed.
-    """
+    """Settings of the denoise stage."""
 
     enabled: bool = True
+    """whether to denoise; if off, observed joints stay as smoothed"""
 
 
 @dataclass(frozen=True)
 class PersonSettings:
-    """Settings of the bones stage.
-
-    Attributes:
-        enabled: whether to measure bones; if off, every body has a generic adult's bones.
-        samples: frames sampled before the estimate is frozen.
-        every: frames between two samples, so that their errors are less correlated.
-    """
+    """Settings of the bones stage."""
 
     enabled: bool = True
+    """whether to measure bones; if off, every body has a generic adult's bones"""
     samples: int = 64
+    """frames sampled before the estimate is frozen"""
     every: int = 5
+    """frames between two samples, so that their errors are less correlated"""
 
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """Settings of the score stage.
-
-    Attributes:
-        enabled: whether to score; if off, the anomaly is NaN and the flag is not set.
-        false_alarms: share of frames of clean motion that may be flagged; 0.01 is one frame every three seconds.
-        hold: seconds for which the anomaly must stay below `score.RELEASED` times the threshold for the flag to clear.
-    """
+    """Settings of the score stage."""
 
     enabled: bool = True
+    """whether to score; if off, the anomaly is NaN and the flag is not set"""
     false_alarms: float = 0.001
+    """share of frames of clean motion that may be flagged; 0.01 is one frame every three seconds"""
     hold: float = 0.3
+    """seconds for which the anomaly must stay below `score.RELEASED` times the threshold for the flag to clear"""
 
 
 @dataclass(frozen=True)
 class ImputeSettings:
-    """Settings of the impute stage.
-
-    Attributes:
-        enabled: whether to impute; if off, hidden joints keep their last local rotations.
-    """
+    """Settings of the impute stage."""
 
     enabled: bool = True
+    """whether to impute; if off, hidden joints keep their last local rotations"""
 
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """Settings of the refine stage.
-
-    Attributes:
-        enabled: whether to refine. If off (the default), the solved rotations pass unchanged and no model is loaded.
-            With `impute` and `fuse` on, observed joints stay as smoothed and hidden joints as completed. Refinement
-            then changes no result by 0.1 mm (validation people, benchmarks/NOTEBOOK.md).
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
+    """Settings of the refine stage."""
 
     enabled: bool = False
+    """whether to refine. If off (the default), the solved rotations pass unchanged and no model is loaded. With
+    `impute` and `fuse` on, observed joints stay as smoothed and hidden joints as completed. Refinement then changes
+    no result by 0.1 mm (validation people, benchmarks/NOTEBOOK.md)"""
     weights: str = weights_setting("hmvae")
+    """weight set (``default``, ``research``) or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """Settings of the fuse stage. Standard deviations are along one axis.
-
-    Attributes:
-        enabled: whether to fuse; if off, the body has the decoded rotations, translated to fit the observed joints.
-        prior_sigma: metres, standard deviation of a joint placed by the decoded rotations in a well observed body.
-        prior_drift: m/s, growth of this deviation for an unobserved joint.
-        fade: seconds after which a joint that is neither observed nor completed within `fuse.MAX_SIGMA` is unknown.
-        weights: weight set of the occlusion network, or a path to a ``.safetensors`` file.
-    """
+    """Settings of the fuse stage. Standard deviations are along one axis."""
 
     enabled: bool = True
+    """whether to fuse; if off, the body has the decoded rotations, translated to fit the observed joints"""
     prior_sigma: float = 0.1
+    """metres, standard deviation of a joint placed by the decoded rotations in a well observed body"""
     prior_drift: float = 0.25
+    """m/s, growth of this deviation for an unobserved joint"""
     fade: float = 3.0
+    """seconds after which a joint that is neither observed nor completed within `fuse.MAX_SIGMA` is unknown"""
     weights: str = weights_setting("occlusion")
+    """weight set of the occlusion network, or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)
 class PostureSettings:
-    """Settings of the posture stage.
-
-    Attributes:
-        enabled: whether joints inform each other; if off, they stay as fused.
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
+    """Settings of the posture stage."""
 
     enabled: bool = True
+    """whether joints inform each other; if off, they stay as fused"""
     weights: str = weights_setting("posture")
+    """weight set (``default``, ``research``) or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)
 class OrientSettings:
-    """Settings of the orient stage.
-
-    Attributes:
-        enabled: whether to orient; if off, rotations are solved frame by frame from the published joints.
-        weights: weight set (``default``, ``research``) or a path to a ``.safetensors`` file.
-    """
+    """Settings of the orient stage."""
 
     enabled: bool = True
+    """whether to orient; if off, rotations are solved frame by frame from the published joints"""
     weights: str = weights_setting("posture")
+    """weight set (``default``, ``research``) or a path to a ``.safetensors`` file"""
 
 
 @dataclass(frozen=True)

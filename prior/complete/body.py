@@ -47,17 +47,14 @@ times (s u / (s + u))^1.5. In gaps of more than 3 s and beyond a recording's end
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of the completer's output, measured on validation people.
-
-    Attributes:
-        far: (22,) metres along an axis, standard deviation of each joint far from the frames in which it is known.
-        half: frames from a joint's nearest known frame at which its standard deviation is half of that.
-        posture: Gaussian of postures, for joints that are known in no frame.
-    """
+    """Uncertainty of the completer's output, measured on validation people."""
 
     far: Sequence[float]
+    """(22,) metres along an axis, standard deviation of each joint far from the frames in which it is known"""
     half: float
+    """frames from a joint's nearest known frame at which its standard deviation is half of that"""
     posture: LivePosture
+    """Gaussian of postures, for joints that are known in no frame"""
 
     def of(self, given: Floats) -> Floats:
         """(T, 22) metres along an axis, standard deviations of joints (T, 22, 3) metres, NaN where not given.
@@ -98,19 +95,16 @@ BENT = 0.02
 
 @dataclass(frozen=True)
 class Completed:
-    """A body's completed motion.
-
-    Attributes:
-        positions: (T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all known frames.
-        rotations: (T, 22, 3, 3) local; NaN likewise.
-        known: (T, 22) which joints were given.
-        span: length of the longest gap that was filled, frames.
-    """
+    """A body's completed motion."""
 
     positions: Floats
+    """(T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all known frames"""
     rotations: Floats
+    """(T, 22, 3, 3) local; NaN likewise"""
     known: Bools
+    """(T, 22) which joints were given"""
     span: int
+    """length of the longest gap that was filled, frames"""
 
 
 def complete(

@@ -56,36 +56,30 @@ class CompletionError(ValueError):
 
 @dataclass(frozen=True)
 class Stretch:
-    """A body on the grid, from its first observation until it was unobserved for long.
-
-    Attributes:
-        body: its id.
-        first: index on the grid of its first frame.
-        given: (T, 22, 3) metres, z up; NaN where unknown.
-        offsets: (22, 3) metres, its bones.
-    """
+    """A body on the grid, from its first observation until it was unobserved for long."""
 
     body: int
+    """its id"""
     first: int
+    """index on the grid of its first frame"""
     given: Floats
+    """(T, 22, 3) metres, z up; NaN where unknown"""
     offsets: Floats
+    """(22, 3) metres, its bones"""
 
 
 @dataclass(frozen=True)
 class Completion:
-    """The completion of a recording.
-
-    Attributes:
-        anchor_ns: stamp of the grid's first frame.
-        done: every stretch with its completion.
-        clean: ``pose/clean`` of the frames with a body, and the end of the stream.
-        centred: ids of bodies whose pelvis is at the origin, so that their trajectory is predicted from their motion.
-    """
+    """The completion of a recording."""
 
     anchor_ns: int
+    """stamp of the grid's first frame"""
     done: list[tuple[Stretch, Completed]]
+    """every stretch with its completion"""
     clean: list[PoseClean]
+    """``pose/clean`` of the frames with a body, and the end of the stream"""
     centred: list[int]
+    """ids of bodies whose pelvis is at the origin, so that their trajectory is predicted from their motion"""
 
     @property
     def given(self) -> float:

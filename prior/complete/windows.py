@@ -22,15 +22,12 @@ _HOP = 32
 
 
 class View(NamedTuple):
-    """A window.
-
-    Attributes:
-        start: its first frame.
-        weight: (frames,) weight of its output where windows overlap.
-    """
+    """A window."""
 
     start: int
+    """its first frame"""
     weight: Floats
+    """(frames,) weight of its output where windows overlap"""
 
     @property
     def frames(self) -> slice:

@@ -45,19 +45,16 @@ _MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
 
 @dataclass(frozen=True)
 class Seen:
-    """One body while it is present without a gap, at 30 Hz.
-
-    Attributes:
-        id: id of the body.
-        clean: (T,) messages that contain it.
-        bodies: (T,) the body in ``pose/clean``.
-        calibrated: whether the world's floor is at 0.
-    """
+    """One body while it is present without a gap, at 30 Hz."""
 
     id: int
+    """id of the body"""
     clean: Sequence[PoseClean]
+    """(T,) messages that contain it"""
     bodies: Sequence[CleanBody]
+    """(T,) the body in ``pose/clean``"""
     calibrated: bool
+    """whether the world's floor is at 0"""
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -83,17 +80,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Fit:
-    """The fit of a body.
-
-    Attributes:
-        seen: the body.
-        track: the fit; None if it failed, so that ``pose/clean`` stays.
-        misfit: (T, 22) remaining distance from the observations, metres or pixels; NaN where a joint is unobserved.
-    """
+    """The fit of a body."""
 
     seen: Seen
+    """the body"""
     track: FittedTrack | None
+    """the fit; None if it failed, so that ``pose/clean`` stays"""
     misfit: Floats
+    """(T, 22) remaining distance from the observations, metres or pixels; NaN where a joint is unobserved"""
 
 
 def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[Seen]:

@@ -66,17 +66,14 @@ def bisquare(square: Tensor, scale: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Transitions(Quadratic):
-    """E_CVAE, and the defect of each step: the difference of its next state from the decoder's.
-
-    Attributes:
-        joints_sigma: metres, the decoder's error of joints in a step.
-        rotations_sigma: the decoder's error of entries of rotation matrices.
-        latent_sigma: scale of the prior's standard deviation: 1 is the prior, more is wider.
-    """
+    """E_CVAE, and the defect of each step: the difference of its next state from the decoder's."""
 
     joints_sigma: float = 0.008
+    """metres, the decoder's error of joints in a step"""
     rotations_sigma: float = 0.04
+    """the decoder's error of entries of rotation matrices"""
     latent_sigma: float = 1.0
+    """scale of the prior's standard deviation: 1 is the prior, more is wider"""
 
     def residual(self, motion: Motion) -> Tensor:
         predicted, _ = motion.predicted
@@ -91,16 +88,12 @@ class Transitions(Quadratic):
 
 @dataclass(frozen=True)
 class FirstState(Quadratic):
-    """E_init, by the most likely component of the mixture (max-mixture, Olson and Agarwal 2013).
-
-    Attributes:
-        sigma: scale of the mixture's standard deviations: 1 is the mixture, more is wider.
-        all_states: whether it applies to all states and not only the first: a pose prior for stages without a motion
-            prior.
-    """
+    """E_init, by the most likely component of the mixture (max-mixture, Olson and Agarwal 2013)."""
 
     sigma: float = 1.0
+    """scale of the mixture's standard deviations: 1 is the mixture, more is wider"""
     all_states: bool = False
+    """whether it applies to all states and not only the first: a pose prior for stages without a motion prior"""
 
     def residual(self, motion: Motion) -> Tensor:
         inputs = motion.inputs if self.all_states else motion.inputs[:1]
@@ -113,13 +106,10 @@ class FirstState(Quadratic):
 
 @dataclass(frozen=True)
 class Smooth(Quadratic):
-    """E_smooth, of the joints' accelerations: a motion prior without knowledge of bodies.
-
-    Attributes:
-        sigma: m/s² along an axis; one for all, or one for each joint of each frame but the first and last, (T - 2, 22).
-    """
+    """E_smooth, of the joints' accelerations: a motion prior without knowledge of bodies."""
 
     sigma: float | Tensor = 4.0
+    """m/s² along an axis; one for all, or one for each joint of each frame but the first and last, (T - 2, 22)"""
 
     def residual(self, motion: Motion) -> Tensor:
         sigma = self.sigma.unsqueeze(-1) if isinstance(self.sigma, Tensor) else self.sigma
@@ -128,13 +118,10 @@ class Smooth(Quadratic):
 
 @dataclass(frozen=True)
 class Bones(Quadratic):
-    """E_shape: bones stay near their initial values.
-
-    Attributes:
-        sigma: metres along an axis.
-    """
+    """E_shape: bones stay near their initial values."""
 
     sigma: float = 0.01
+    """metres along an axis"""
 
     def residual(self, motion: Motion) -> Tensor:
         return motion.variables.bones / self.sigma
@@ -142,17 +129,14 @@ class Bones(Quadratic):
 
 @dataclass(frozen=True)
 class Ground(Quadratic):
-    """E_gnd: a normal prior of the ground's height and tilt.
-
-    Attributes:
-        height: metres, world, mean height.
-        height_sigma: metres, standard deviation of the height.
-        tilt_sigma: radians, standard deviation of the tilt.
-    """
+    """E_gnd: a normal prior of the ground's height and tilt."""
 
     height: float
+    """metres, world, mean height"""
     height_sigma: float
+    """metres, standard deviation of the height"""
     tilt_sigma: float
+    """radians, standard deviation of the tilt"""
 
     def residual(self, motion: Motion) -> Tensor:
         ground = motion.variables.ground
@@ -164,14 +148,12 @@ class Standing(Quadratic):
     """E_env: joints in contact do not move and are at their contact height; no foot is below the ground.
 
     The decoder's contact probabilities weigh the term, detached. Otherwise, having no contacts would be cheapest.
-
-    Attributes:
-        speed_sigma: m/s along an axis, standard deviation of the velocity of a joint in contact.
-        height_sigma: metres, standard deviation of heights beyond `CONTACT_HEIGHT` and below the ground.
     """
 
     speed_sigma: float = 0.1
+    """m/s along an axis, standard deviation of the velocity of a joint in contact"""
     height_sigma: float = 0.02
+    """metres, standard deviation of heights beyond `CONTACT_HEIGHT` and below the ground"""
 
     def residual(self, motion: Motion) -> Tensor:
         joints = motion.joints[:, _CONTACTS]
@@ -187,15 +169,12 @@ class Standing(Quadratic):
 
 @dataclass(frozen=True)
 class Anchored(Quadratic):
-    """The first F frames stay near the result of the window before.
-
-    Attributes:
-        joints: (F, 22, 3) metres, world.
-        sigma: metres along an axis.
-    """
+    """The first F frames stay near the result of the window before."""
 
     joints: Tensor
+    """(F, 22, 3) metres, world"""
     sigma: float = 0.005
+    """metres along an axis"""
 
     def residual(self, motion: Motion) -> Tensor:
         return (motion.world_joints[: len(self.joints)] - self.joints) / self.sigma

@@ -46,23 +46,20 @@ POSE = 3 + 6 * JOINT_COUNT
 
 @dataclass(frozen=True)
 class HumorConfig:
-    """Sizes, and switches of the ablations.
-
-    Attributes:
-        latent: dimensions of a transition's latent.
-        hidden: width of the hidden layers.
-        learned_prior: whether the prior depends on the state; if not, it is N(0, I), as in a Motion VAE.
-        residual: whether the decoder outputs the change of the state; if not, it outputs the next pose.
-        contacts: whether it predicts contacts.
-        components: number of components of the mixture of initial states.
-    """
+    """Sizes, and switches of the ablations."""
 
     latent: int = 48
+    """dimensions of a transition's latent"""
     hidden: int = 512
+    """width of the hidden layers"""
     learned_prior: bool = True
+    """whether the prior depends on the state; if not, it is N(0, I), as in a Motion VAE"""
     residual: bool = True
+    """whether the decoder outputs the change of the state; if not, it outputs the next pose"""
     contacts: bool = True
+    """whether it predicts contacts"""
     components: int = 12
+    """number of components of the mixture of initial states"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HumorConfig:
@@ -72,15 +69,12 @@ class HumorConfig:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A diagonal Gaussian of latents.
-
-    Attributes:
-        mean: (..., latent).
-        log_variance: the same shape.
-    """
+    """A diagonal Gaussian of latents."""
 
     mean: Tensor
+    """(..., latent)"""
     log_variance: Tensor
+    """the same shape"""
 
     @property
     def sigma(self) -> Tensor:
@@ -209,17 +203,14 @@ def _gaussian(output: Tensor) -> Gaussian:
 
 @dataclass(frozen=True)
 class Rollout:
-    """T predicted steps.
-
-    Attributes:
-        states: (..., T) states, without the initial one.
-        latents: (..., T, latent) latents of the steps.
-        contacts: (..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none.
-    """
+    """T predicted steps."""
 
     states: State
+    """(..., T) states, without the initial one"""
     latents: Tensor
+    """(..., T, latent) latents of the steps"""
     contacts: Tensor
+    """(..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none"""
 
 
 def roll_out(model: HumorNet, initial: State, latents: Tensor, offsets: Tensor) -> Rollout:

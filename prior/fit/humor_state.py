@@ -30,21 +30,18 @@ _MIN_LEVEL = 1e-4
 
 @dataclass(frozen=True)
 class State:
-    """States of any number of bodies, z up, floor at 0, with equal leading dimensions (...).
-
-    Attributes:
-        root: (..., 3) metres, the pelvis.
-        rotations: (..., 22, 3, 3) local; the root's is its orientation.
-        joints: (..., 22, 3) metres.
-        velocity: (..., 22, 3) m/s, velocities of the joints since the previous step.
-        turning: (..., 3) rad/s, angular velocity of the root since the previous step.
-    """
+    """States of any number of bodies, z up, floor at 0, with equal leading dimensions (...)."""
 
     root: Tensor
+    """(..., 3) metres, the pelvis"""
     rotations: Tensor
+    """(..., 22, 3, 3) local; the root's is its orientation"""
     joints: Tensor
+    """(..., 22, 3) metres"""
     velocity: Tensor
+    """(..., 22, 3) m/s, velocities of the joints since the previous step"""
     turning: Tensor
+    """(..., 3) rad/s, angular velocity of the root since the previous step"""
 
     def __getitem__(self, at: object) -> State:
         """Select bodies by indices of the leading dimensions."""

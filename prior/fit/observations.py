@@ -48,15 +48,12 @@ class Observed(Term, Protocol):
 
 @dataclass(frozen=True)
 class SeenJoints:
-    """E_data of 3D joints or key points, some of them hidden.
-
-    Attributes:
-        positions: (T, 22, 3) metres, world; NaN where unobserved.
-        sigma: (T, 22) metres along an axis, standard deviations.
-    """
+    """E_data of 3D joints or key points, some of them hidden."""
 
     positions: Tensor
+    """(T, 22, 3) metres, world; NaN where unobserved"""
     sigma: Tensor
+    """(T, 22) metres along an axis, standard deviations"""
 
     @cached_property
     def _seen(self) -> Tensor:
@@ -77,19 +74,16 @@ class SeenJoints:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A fixed pinhole camera.
-
-    Attributes:
-        focal: (2,) pixels.
-        centre: (2,) pixels.
-        rotation: (3, 3) rotation from its optical frame (x right, y down, z forward) to the world.
-        position: (3,) metres, world.
-    """
+    """A fixed pinhole camera."""
 
     focal: Tensor
+    """(2,) pixels"""
     centre: Tensor
+    """(2,) pixels"""
     rotation: Tensor
+    """(3, 3) rotation from its optical frame (x right, y down, z forward) to the world"""
     position: Tensor
+    """(3,) metres, world"""
 
     def project(self, points: Tensor) -> Tensor:
         """(..., 2) pixels of points (..., 3) metres, world; depths are at least 0.1 m."""
@@ -99,19 +93,16 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """E_data of key points in an image, weighted by their confidence, with the Geman-McClure kernel.
-
-    Attributes:
-        pixels: (T, 22, 2); NaN where not detected.
-        confidence: (T, 22) 0 to 1, the weight, as in the paper; the official code uses its square.
-        camera: the camera.
-        sigma: pixels along an axis, standard deviation.
-    """
+    """E_data of key points in an image, weighted by their confidence, with the Geman-McClure kernel."""
 
     pixels: Tensor
+    """(T, 22, 2); NaN where not detected"""
     confidence: Tensor
+    """(T, 22) 0 to 1, the weight, as in the paper; the official code uses its square"""
     camera: Pinhole
+    """the camera"""
     sigma: float
+    """pixels along an axis, standard deviation"""
 
     @cached_property
     def _seen(self) -> Tensor:
@@ -143,18 +134,16 @@ class SurfacePoints:
 
     A camera sees only the side of a body that faces it. With the distance from a closed surface, a point that noise
     puts behind a limb's centre would pull towards the limb's back, and the points in front would then bias the body.
-
-    Attributes:
-        points: (T, N, 3) metres, world, padded with NaN.
-        camera: (3,) or (T, 3) metres, world, position of the camera.
-        sigma: metres, standard deviation.
-        weight: weight of a point, below 1 because neighbouring errors are correlated.
     """
 
     points: Tensor
+    """(T, N, 3) metres, world, padded with NaN"""
     camera: Tensor
+    """(3,) or (T, 3) metres, world, position of the camera"""
     sigma: float = POINT_SIGMA
+    """metres, standard deviation"""
     weight: float = 1.0
+    """weight of a point, below 1 because neighbouring errors are correlated"""
 
     @cached_property
     def _seen(self) -> Tensor:

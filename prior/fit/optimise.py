@@ -46,21 +46,18 @@ AGREE_WEIGHT = 1.0
 
 @dataclass(frozen=True)
 class _Known:
-    """The known entries of W windows of T frames, in the windows' frames.
-
-    Attributes:
-        columns: (W, T, 22, 6) first two columns of local rotations.
-        rotations: (W, T, 22, 1) 1 where rotations are known, else 0.
-        joints: (W, T, 22, 3) metres relative to the root.
-        places: (W, T, 22, 1) 1 where joints are known, else 0.
-        offsets: (22, 3) metres, bones.
-    """
+    """The known entries of W windows of T frames, in the windows' frames."""
 
     columns: Tensor
+    """(W, T, 22, 6) first two columns of local rotations"""
     rotations: Tensor
+    """(W, T, 22, 1) 1 where rotations are known, else 0"""
     joints: Tensor
+    """(W, T, 22, 3) metres relative to the root"""
     places: Tensor
+    """(W, T, 22, 1) 1 where joints are known, else 0"""
     offsets: Tensor
+    """(22, 3) metres, bones"""
 
     def loss(self, decoded: Tensor) -> Tensor:
         """Equation 14 for windows (W, T, 22, 6); each term is a mean over known entries."""

@@ -42,17 +42,14 @@ _AXES = [2, 0, 1]
 
 @dataclass(frozen=True)
 class SmplShape:
-    """A model's first 22 joints in the rest pose.
-
-    Attributes:
-        rest: (22, 3) metres, joints of the mean shape; x forward, y left, z up.
-        change: (22, 3, B) metres per unit of each beta, B up to `BETAS`.
-        gender: gender in the file's name.
-    """
+    """A model's first 22 joints in the rest pose."""
 
     rest: Floats
+    """(22, 3) metres, joints of the mean shape; x forward, y left, z up"""
     change: Floats
+    """(22, 3, B) metres per unit of each beta, B up to `BETAS`"""
     gender: str
+    """gender in the file's name"""
 
     @classmethod
     def read(cls, path: Path) -> SmplShape:
@@ -99,21 +96,18 @@ class SmplShape:
 
 @dataclass(frozen=True)
 class SmplMotion:
-    """A motion of T frames at 30 Hz, z up.
-
-    Attributes:
-        poses: (T, `POSES`) radians, rotation vectors, the root's first.
-        betas: (`BETAS`,) 0 where the model has fewer.
-        trans: (T, 3) metres, translations.
-        gender: gender of the model.
-        joints: (T, 22, 3) metres, the model's joints.
-    """
+    """A motion of T frames at 30 Hz, z up."""
 
     poses: Floats
+    """(T, `POSES`) radians, rotation vectors, the root's first"""
     betas: Floats
+    """(`BETAS`,) 0 where the model has fewer"""
     trans: Floats
+    """(T, 3) metres, translations"""
     gender: str
+    """gender of the model"""
     joints: Floats
+    """(T, 22, 3) metres, the model's joints"""
 
     @property
     def arrays(self) -> dict[str, Any]:

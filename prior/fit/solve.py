@@ -86,21 +86,18 @@ PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, accel
 
 @dataclass(frozen=True)
 class Start:
-    """Initial poses of T frames, in the world.
-
-    Attributes:
-        root: (T, 3) metres.
-        rotations: (T, 22, 3, 3) local.
-        offsets: (22, 3) metres, bones.
-        ground: metres, height of the floor.
-        ground_known: whether the height is certain, as for a calibrated camera; if not, it is the mean of a prior.
-    """
+    """Initial poses of T frames, in the world."""
 
     root: Tensor
+    """(T, 3) metres"""
     rotations: Tensor
+    """(T, 22, 3, 3) local"""
     offsets: Tensor
+    """(22, 3) metres, bones"""
     ground: float = 0.0
+    """metres, height of the floor"""
     ground_known: bool = False
+    """whether the height is certain, as for a calibrated camera; if not, it is the mean of a prior"""
 
     @classmethod
     def of(
@@ -121,17 +118,14 @@ class Start:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The fit of a window.
-
-    Attributes:
-        motion: motion of least energy, without gradients, of the last stage or the one before.
-        energies: (stages,) nats, energy of a stage's terms at its end.
-        kept: whether the last stage was kept.
-    """
+    """The fit of a window."""
 
     motion: Motion
+    """motion of least energy, without gradients, of the last stage or the one before"""
     energies: tuple[float, ...]
+    """(stages,) nats, energy of a stage's terms at its end"""
     kept: bool = True
+    """whether the last stage was kept"""
 
 
 def fit_window(

@@ -35,15 +35,12 @@ MIN_FRAMES = 8
 
 @dataclass(frozen=True)
 class Track:
-    """One body at 30 Hz, T frames without a gap.
-
-    Attributes:
-        starts: initial poses; if there are several, each window keeps the fit of least energy.
-        observed: observations of all T frames.
-    """
+    """One body at 30 Hz, T frames without a gap."""
 
     starts: Sequence[Start]
+    """initial poses; if there are several, each window keeps the fit of least energy"""
     observed: Sequence[Observed]
+    """observations of all T frames"""
 
     def __len__(self) -> int:
         return len(self.starts[0].root)
@@ -51,27 +48,24 @@ class Track:
 
 @dataclass(frozen=True)
 class FittedTrack:
-    """The fit of a track.
-
-    Attributes:
-        joints: (T, 22, 3) metres, world.
-        rotations: (T, 22, 3, 3) local; the root's to the world.
-        offsets: (W, 22, 3) metres, the fitted bones of each of W windows.
-        ground: (W, 3) the ground of each window: height, metres, and tilts about x and y, radians.
-        load: (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them.
-        misfit: (K, T, 22) `Observed.misfit` of each of K observations.
-        energies: (W, S) nats after each stage.
-        kept: (W,) whether a window's last stage was kept.
-    """
+    """The fit of a track."""
 
     joints: Floats
+    """(T, 22, 3) metres, world"""
     rotations: Floats
+    """(T, 22, 3, 3) local; the root's to the world"""
     offsets: Floats
+    """(W, 22, 3) metres, the fitted bones of each of W windows"""
     ground: Floats
+    """(W, 3) the ground of each window: height, metres, and tilts about x and y, radians"""
     load: Floats
+    """(T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them"""
     misfit: Floats
+    """(K, T, 22) `Observed.misfit` of each of K observations"""
     energies: Floats
+    """(W, S) nats after each stage"""
     kept: NDArray[np.bool_]
+    """(W,) whether a window's last stage was kept"""
 
 
 def window_bounds(frames: int) -> list[tuple[int, int]]:

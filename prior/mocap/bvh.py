@@ -66,23 +66,20 @@ _WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)")
 
 @dataclass(frozen=True)
 class Bvh:
-    """A BVH file.
-
-    Attributes:
-        joints: names, parents first. The end site of joint ``A`` is ``A_end``; a second one is ``A_end2``.
-        parents: index of each joint's parent; -1 for a root.
-        offsets: (J, 3) in the file's unit and axes.
-        channels: channels of each joint, in the file's order.
-        fps: frames per second.
-        values: (T, C) values of all channels, degrees and the file's unit.
-    """
+    """A BVH file."""
 
     joints: tuple[str, ...]
+    """names, parents first. The end site of joint ``A`` is ``A_end``; a second one is ``A_end2``"""
     parents: tuple[int, ...]
+    """index of each joint's parent; -1 for a root"""
     offsets: NDArray[np.float64]
+    """(J, 3) in the file's unit and axes"""
     channels: tuple[tuple[str, ...], ...]
+    """channels of each joint, in the file's order"""
     fps: float
+    """frames per second"""
     values: NDArray[np.float64]
+    """(T, C) values of all channels, degrees and the file's unit"""
 
     @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:

@@ -30,21 +30,18 @@ POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "mil
 
 @dataclass(frozen=True)
 class Description:
-    """Properties that a motion file lacks or states wrongly. Empty fields are read from the file or recognised.
-
-    Attributes:
-        canonical: canonical joint -> the file's joint, or several joints of which it is the mean.
-        metres: size of the file's unit, metres; 0 to recognise it.
-        up: the axis that points up: ``z``, ``y`` or ``-y``.
-        fps: frames per second; 0 for the file's value.
-        skeleton: skeleton of the joints in arrays without names.
-    """
+    """Properties that a motion file lacks or states wrongly. Empty fields are read from the file or recognised."""
 
     canonical: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    """canonical joint -> the file's joint, or several joints of which it is the mean"""
     metres: float = 0.0
+    """size of the file's unit, metres; 0 to recognise it"""
     up: str = ""
+    """the axis that points up: ``z``, ``y`` or ``-y``"""
     fps: float = 0.0
+    """frames per second; 0 for the file's value"""
     skeleton: str = ""
+    """skeleton of the joints in arrays without names"""
 
 
 UNDESCRIBED = Description()

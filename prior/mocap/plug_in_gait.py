@@ -79,19 +79,16 @@ _HINGES: Mapping[str, _Hinge] = {
 
 @dataclass(frozen=True)
 class Calibration:
-    """Measurements of a subject.
-
-    Attributes:
-        pelvis_width: metres between the front markers of the pelvis.
-        pelvis_depth: metres from their midpoint to the midpoint of the back markers.
-        acromia: metres between the shoulder markers.
-        axis: for each knee and elbow, the angle about the upper limb from its wand to the axis of bending, radians.
-    """
+    """Measurements of a subject."""
 
     pelvis_width: float
+    """metres between the front markers of the pelvis"""
     pelvis_depth: float
+    """metres from their midpoint to the midpoint of the back markers"""
     acromia: float
+    """metres between the shoulder markers"""
     axis: Mapping[str, float]
+    """for each knee and elbow, the angle about the upper limb from its wand to the axis of bending, radians"""
 
 
 def _unit(v: Array) -> Array:

@@ -62,23 +62,20 @@ _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
 
 @dataclass(frozen=True)
 class CompleterConfig:
-    """The sizes of the completer.
-
-    Attributes:
-        width: width of the transformer's tokens, one per frame.
-        heads: number of attention heads of each layer.
-        layers: number of layers.
-        reach: frames at which relative positions are clipped.
-        never_sigma: (22,) metres along an axis, error of each joint if it is never known (validation people).
-        half_frames: frames from a joint's nearest known frame at which its error is half of `never_sigma`.
-    """
+    """The sizes of the completer."""
 
     width: int = 128
+    """width of the transformer's tokens, one per frame"""
     heads: int = 8
+    """number of attention heads of each layer"""
     layers: int = 5
+    """number of layers"""
     reach: int = 64
+    """frames at which relative positions are clipped"""
     never_sigma: tuple[float, ...] = (0.1,) * JOINTS
+    """(22,) metres along an axis, error of each joint if it is never known (validation people)"""
     half_frames: float = 10.0
+    """frames from a joint's nearest known frame at which its error is half of `never_sigma`"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> CompleterConfig:
@@ -89,25 +86,23 @@ class CompleterConfig:
 class Window(NamedTuple):
     """Input of the completer for B windows, each transformed so that the first known root is at the origin and faces
     +x.
-
-    Attributes:
-        features: (B, T, FEATURES) float32.
-        rotations: (B, T, 22, 3, 3) local rotations of the line.
-        root: (B, T, 3) metres, root positions of the line.
-        bend: (B, T, 23, 6) cubics minus the line: first two columns of the rotations and, last, the root (three
-            values in metres and three zeros).
-        line: the interpolation.
-        turn: (B, 3, 3) rotations from the window's frame to the world.
-        origin: (B, 3) metres, world, origin of the window's frame.
     """
 
     features: Floats32
+    """(B, T, FEATURES) float32"""
     rotations: Floats
+    """(B, T, 22, 3, 3) local rotations of the line"""
     root: Floats
+    """(B, T, 3) metres, root positions of the line"""
     bend: Floats32
+    """(B, T, 23, 6) cubics minus the line: first two columns of the rotations and, last, the root (three values in
+    metres and three zeros)"""
     line: Line
+    """the interpolation"""
     turn: Floats
+    """(B, 3, 3) rotations from the window's frame to the world"""
     origin: Floats
+    """(B, 3) metres, world, origin of the window's frame"""
 
 
 def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple[Floats, Bools]:

@@ -77,17 +77,14 @@ def contact_features(
 
 
 class Contacts(NamedTuple):
-    """Contacts of B bodies at `CONTACT_JOINTS`.
-
-    Attributes:
-        load: (B, 8) probabilities that the joints bear load.
-        rest: (B, 8) probabilities that the joints rest on their support.
-        state: (B, hidden) hidden state for the next frame.
-    """
+    """Contacts of B bodies at `CONTACT_JOINTS`."""
 
     load: Floats32
+    """(B, 8) probabilities that the joints bear load"""
     rest: Floats32
+    """(B, 8) probabilities that the joints rest on their support"""
     state: Floats32
+    """(B, hidden) hidden state for the next frame"""
 
 
 class LiveContacts:

@@ -36,25 +36,22 @@ _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 
 @dataclass(frozen=True)
 class HMVAEConfig:
-    """Sizes of an HM-VAE.
-
-    Attributes:
-        window: T, frames of a window.
-        kernel: time steps of a convolution (official: 3 for T = 8, 15 for T = 64).
-        strides: strides of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64).
-        local_latent: dimensions of z_l per edge (official: 6; 12).
-        global_latent: dimensions of z_g per edge (official: 6; 24).
-        about_mean: whether each joint's rotations are encoded and decoded in the frame of their observed mean over the
-            window. The paper encodes the rotations themselves, and its error is mostly constant over the window. With
-            the mean given, only the motion within the window has to be encoded. The encoder also sees the mean pose.
-    """
+    """Sizes of an HM-VAE."""
 
     window: int = 8
+    """T, frames of a window"""
     kernel: int = 3
+    """time steps of a convolution (official: 3 for T = 8, 15 for T = 64)"""
     strides: tuple[int, int, int, int] = (1, 2, 2, 1)
+    """strides of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64)"""
     local_latent: int = 6
+    """dimensions of z_l per edge (official: 6; 12)"""
     global_latent: int = 6
+    """dimensions of z_g per edge (official: 6; 24)"""
     about_mean: bool = False
+    """whether each joint's rotations are encoded and decoded in the frame of their observed mean over the window. The
+    paper encodes the rotations themselves, and its error is mostly constant over the window. With the mean given,
+    only the motion within the window has to be encoded. The encoder also sees the mean pose"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:

@@ -60,19 +60,16 @@ _LEAST = 1e-6
 
 
 class Expected(NamedTuple):
-    """Expected joints of B bodies.
-
-    Attributes:
-        positions: (B, 22, 3) metres.
-        sigma: (B, 22) metres, their standard deviations along an axis.
-        root: (B, 3, 3) orientations of the pelvis.
-        root_covariance: (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise.
-    """
+    """Expected joints of B bodies."""
 
     positions: Floats
+    """(B, 22, 3) metres"""
     sigma: Floats
+    """(B, 22) metres, their standard deviations along an axis"""
     root: Floats
+    """(B, 3, 3) orientations of the pelvis"""
     root_covariance: Floats
+    """(B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise"""
 
 
 class LivePosture:

@@ -31,18 +31,15 @@ FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0
 
 @dataclass(frozen=True)
 class TrajectoryConfig:
-    """The size of the network, and its errors on validation.
-
-    Attributes:
-        hidden: size of a body's hidden state.
-        sigma_scale: (horizontal, vertical) error-to-sigma ratio of the predicted velocity.
-        correlation_s: (horizontal, vertical) seconds, correlation time of the velocity's error: twice the integral of
-            its normalised autocorrelation.
-    """
+    """The size of the network, and its errors on validation."""
 
     hidden: int = 128
+    """size of a body's hidden state"""
     sigma_scale: tuple[float, float] = (1.0, 1.0)
+    """(horizontal, vertical) error-to-sigma ratio of the predicted velocity"""
     correlation_s: tuple[float, float] = (FRAME_S, FRAME_S)
+    """(horizontal, vertical) seconds, correlation time of the velocity's error: twice the integral of its normalised
+    autocorrelation"""
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> TrajectoryConfig:
@@ -52,17 +49,14 @@ class TrajectoryConfig:
 
 
 class NewestMotion(NamedTuple):
-    """The network's output for a frame, in the frame of its input.
-
-    Attributes:
-        velocity: (B, 3) m/s, velocity of the root.
-        log_sigma: (B, 3) logarithm of the velocity's standard deviation along each axis, in m/s.
-        state: (B, hidden) hidden state for the next frame.
-    """
+    """The network's output for a frame, in the frame of its input."""
 
     velocity: Floats32
+    """(B, 3) m/s, velocity of the root"""
     log_sigma: Floats32
+    """(B, 3) logarithm of the velocity's standard deviation along each axis, in m/s"""
     state: Floats32
+    """(B, hidden) hidden state for the next frame"""
 
 
 def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> NDArray[np.float32]:

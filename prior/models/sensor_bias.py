@@ -27,15 +27,12 @@ FEATURES = 3 * VECTORS + 2 + 22
 
 @dataclass(frozen=True)
 class CorrectionConfig:
-    """Sizes of a correction network.
-
-    Attributes:
-        hidden: width of its two hidden layers.
-        sensor: name of the sensor that it corrects.
-    """
+    """Sizes of a correction network."""
 
     hidden: int = 256
+    """width of its two hidden layers"""
     sensor: str = "kinect_v2"
+    """name of the sensor that it corrects"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> CorrectionConfig:

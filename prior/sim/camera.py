@@ -39,33 +39,30 @@ FRAME_ID = "camera_optical_frame"
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera: its pose, field of view, timing and tracker.
-
-    Attributes:
-        position: metres, world.
-        look_at: metres, world, the point in the middle of the image.
-        roll: radians about the line of sight, positive clockwise as seen in the image.
-        field_of_view: radians, horizontal and vertical.
-        near: metres, distance below which it measures no depth.
-        background: metres along the line of sight to the wall behind the people.
-        fps: nominal frames per second.
-        stamp_jitter: seconds, standard deviation of the frames' times about equal intervals.
-        drop_rate: share of frames that never arrive.
-        skeleton: joint layout of its tracker.
-        calibrated: whether its pose in the world is known; if not, only the direction of gravity is.
-    """
+    """A camera: its pose, field of view, timing and tracker."""
 
     position: tuple[float, float, float]
+    """metres, world"""
     look_at: tuple[float, float, float]
+    """metres, world, the point in the middle of the image"""
     roll: float = 0.0
+    """radians about the line of sight, positive clockwise as seen in the image"""
     field_of_view: tuple[float, float] = (1.22, 1.05)
+    """radians, horizontal and vertical"""
     near: float = 0.5
+    """metres, distance below which it measures no depth"""
     background: float = 5.5
+    """metres along the line of sight to the wall behind the people"""
     fps: float = 30.0
+    """nominal frames per second"""
     stamp_jitter: float = 0.002
+    """seconds, standard deviation of the frames' times about equal intervals"""
     drop_rate: float = 0.01
+    """share of frames that never arrive"""
     skeleton: str = "kinect22"
+    """joint layout of its tracker"""
     calibrated: bool = True
+    """whether its pose in the world is known; if not, only the direction of gravity is"""
 
     @property
     def orientation(self) -> Floats:
@@ -109,15 +106,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Sight:
-    """Occlusion of joints (T, J) from a camera.
-
-    Attributes:
-        hidden: 0 if visible, 1 behind a body, between 0 and 1 at its edge.
-        beside: metres, depth of the nearest other surface that the ray almost touches; infinite if there is none.
-    """
+    """Occlusion of joints (T, J) from a camera."""
 
     hidden: Floats
+    """0 if visible, 1 behind a body, between 0 and 1 at its edge"""
     beside: Floats
+    """metres, depth of the nearest other surface that the ray almost touches; infinite if there is none"""
 
 
 def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:

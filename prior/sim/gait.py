@@ -127,23 +127,20 @@ class Turn:
 
 @dataclass(frozen=True)
 class Plan:
-    """The pelvis over the floor.
-
-    Attributes:
-        times: (T,) seconds at `RATE`.
-        xy: (T, 2) metres, world.
-        yaw: (T,) radians, unwrapped.
-        phase: (T,) strides made.
-        speed: (T,) m/s along the path.
-        moves: slice of frames of each walk or turn.
-    """
+    """The pelvis over the floor."""
 
     times: Floats
+    """(T,) seconds at `RATE`"""
     xy: Floats
+    """(T, 2) metres, world"""
     yaw: Floats
+    """(T,) radians, unwrapped"""
     phase: Floats
+    """(T,) strides made"""
     speed: Floats
+    """(T,) m/s along the path"""
     moves: tuple[slice, ...]
+    """slice of frames of each walk or turn"""
 
     def when(self, seconds: float) -> int:
         """Return the index of the frame at a time."""
@@ -210,21 +207,18 @@ def _phase(before: float, speed: Floats, heading: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class FootTrack:
-    """One foot over time.
-
-    Attributes:
-        ankle: (T, 3) metres, world.
-        yaw: (T,) radians, direction of the foot.
-        pitch: (T,) radians, positive with the toe down.
-        heel_planted: (T,) whether the ankle stays in place.
-        toe_planted: (T,) whether the ball of the foot stays in place.
-    """
+    """One foot over time."""
 
     ankle: Floats
+    """(T, 3) metres, world"""
     yaw: Floats
+    """(T,) radians, direction of the foot"""
     pitch: Floats
+    """(T,) radians, positive with the toe down"""
     heel_planted: NDArray[np.bool_]
+    """(T,) whether the ankle stays in place"""
     toe_planted: NDArray[np.bool_]
+    """(T,) whether the ball of the foot stays in place"""
 
     @property
     def rotation(self) -> Floats:

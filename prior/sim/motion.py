@@ -26,21 +26,18 @@ SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
 
 @dataclass(frozen=True)
 class Motion:
-    """One person's true motion.
-
-    Attributes:
-        times: (T,) seconds, evenly spaced.
-        offsets: (22, 3) metres, the bones.
-        root: (T, 3) metres, position of the pelvis in the world.
-        rotations: (T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world.
-        contacts: (T, 8) which of `CONTACT_JOINTS` rest on the floor.
-    """
+    """One person's true motion."""
 
     times: Floats
+    """(T,) seconds, evenly spaced"""
     offsets: Floats
+    """(22, 3) metres, the bones"""
     root: Floats
+    """(T, 3) metres, position of the pelvis in the world"""
     rotations: Floats
+    """(T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world"""
     contacts: NDArray[np.bool_]
+    """(T, 8) which of `CONTACT_JOINTS` rest on the floor"""
 
     @cached_property
     def _posed(self) -> tuple[Floats, Floats]:
@@ -78,41 +75,35 @@ class Motion:
 
 @dataclass(frozen=True)
 class ArmAction:
-    """An action of an arm, blended with its swing.
-
-    Attributes:
-        weight: (T,) 0 for the swing, 1 for this action.
-        wrist: (T, 3) or (3,) metres, target of the wrist in ``frame``.
-        pole: (T, 3) or (3,) direction in which the elbow points, in the chest's frame.
-        frame: "world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame,
-            origin at this arm's shoulder, in arm lengths.
-    """
+    """An action of an arm, blended with its swing."""
 
     weight: Floats
+    """(T,) 0 for the swing, 1 for this action"""
     wrist: Floats
+    """(T, 3) or (3,) metres, target of the wrist in ``frame``"""
     pole: Floats
+    """(T, 3) or (3,) direction in which the elbow points, in the chest's frame"""
     frame: Literal["world", "pelvis", "shoulder"]
+    """"world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame, origin at
+    this arm's shoulder, in arm lengths"""
 
 
 @dataclass
 class Intent:
-    """Everything that a script controls; the rest of the body is at rest.
-
-    Attributes:
-        plan: path of the body.
-        shift: (T, 3) metres, pelvis relative to the plan in the heading frame; z relative to standing.
-        tilt: (T,) radians, forward tilt of the pelvis.
-        torso: (T, 3) radians: roll (to the right positive), pitch (forward positive), yaw (to the left positive).
-        gaze: (T, 2) radians: yaw and pitch of the head beyond the torso's.
-        arms: actions of each arm, in order; a later action overrides an earlier one.
-    """
+    """Everything that a script controls; the rest of the body is at rest."""
 
     plan: Plan
+    """path of the body"""
     shift: Floats = field(init=False)
+    """(T, 3) metres, pelvis relative to the plan in the heading frame; z relative to standing"""
     tilt: Floats = field(init=False)
+    """(T,) radians, forward tilt of the pelvis"""
     torso: Floats = field(init=False)
+    """(T, 3) radians: roll (to the right positive), pitch (forward positive), yaw (to the left positive)"""
     gaze: Floats = field(init=False)
+    """(T, 2) radians: yaw and pitch of the head beyond the torso's"""
     arms: dict[Side, list[ArmAction]] = field(default_factory=lambda: {"left": [], "right": []})
+    """actions of each arm, in order; a later action overrides an earlier one"""
 
     def __post_init__(self) -> None:
         n = len(self.plan.times)

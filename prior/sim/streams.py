@@ -34,25 +34,22 @@ class ManifestError(ValueError):
 
 @dataclass(frozen=True)
 class Stream:
-    """The recipe of one stream.
-
-    Attributes:
-        name: name of the stream and its directory.
-        what: description in one line.
-        script: a key of `prior.sim.scripts.SCRIPTS`.
-        seed: random seed of body, motion and noise.
-        camera: the camera.
-        noise: file with the noise's parameters.
-        seconds: duration that is kept; the whole script if None.
-    """
+    """The recipe of one stream."""
 
     name: str
+    """name of the stream and its directory"""
     what: str
+    """description in one line"""
     script: str
+    """a key of `prior.sim.scripts.SCRIPTS`"""
     seed: int
+    """random seed of body, motion and noise"""
     camera: Camera
+    """the camera"""
     noise: Path = KINECT_NOISE
+    """file with the noise's parameters"""
     seconds: float | None = None
+    """duration that is kept; the whole script if None"""
 
 
 def read_manifest(path: Path) -> dict[str, Stream]:

@@ -16,17 +16,14 @@ INITIAL_SPEED = 1.0
 
 
 class Smoothed(NamedTuple):
-    """The estimate of one frame.
-
-    Attributes:
-        stamp_s: seconds.
-        positions: (..., 3) metres; NaN for a joint that has not been observed yet.
-        sigma: (...) metres, standard deviation along an axis; inf where positions are NaN.
-    """
+    """The estimate of one frame."""
 
     stamp_s: float
+    """seconds"""
     positions: Floats
+    """(..., 3) metres; NaN for a joint that has not been observed yet"""
     sigma: Floats
+    """(...) metres, standard deviation along an axis; inf where positions are NaN"""
 
 
 class ConstantVelocityFilter:

@@ -31,25 +31,22 @@ _NO_STANCE = Stance(np.zeros(4), np.zeros(4))
 
 @dataclass(frozen=True)
 class BodyEstimate:
-    """The stages' estimates for one body of a message.
-
-    Attributes:
-        observed: the input.
-        velocity: predicted root velocity; None if the network is off.
-        contacts: predicted contacts.
-        guessed: (6,) which joints of legs (`LEG_CONTACTS`) are only guesses.
-        stance: feet that may anchor the root.
-        root: the filter's estimate of root and feet.
-        feet: feet for publication.
-    """
+    """The stages' estimates for one body of a message."""
 
     observed: BodyObservation
+    """the input"""
     velocity: RootVelocity | None
+    """predicted root velocity; None if the network is off"""
     contacts: Contacts
+    """predicted contacts"""
     guessed: Bools
+    """(6,) which joints of legs (`LEG_CONTACTS`) are only guesses"""
     stance: Stance
+    """feet that may anchor the root"""
     root: RootState
+    """the filter's estimate of root and feet"""
     feet: FeetState
+    """feet for publication"""
 
 
 @dataclass

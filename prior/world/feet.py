@@ -53,15 +53,12 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class FeetState(NamedTuple):
-    """Published feet.
-
-    Attributes:
-        positions: (4, 3) metres, world, positions of `FEET`; NaN where unknown.
-        sigma: (4,) metres, standard deviations along an axis.
-    """
+    """Published feet."""
 
     positions: Floats
+    """(4, 3) metres, world, positions of `FEET`; NaN where unknown"""
     sigma: Floats
+    """(4,) metres, standard deviations along an axis"""
 
 
 class Feet:

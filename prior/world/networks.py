@@ -33,15 +33,12 @@ _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
 
 
 class RootVelocity(NamedTuple):
-    """The predicted root velocity of a body, in the world.
-
-    Attributes:
-        velocity: (3,) m/s.
-        sigma: (3,) m/s, standard deviation, calibrated on validation.
-    """
+    """The predicted root velocity of a body, in the world."""
 
     velocity: Floats
+    """(3,) m/s"""
     sigma: Floats
+    """(3,) m/s, standard deviation, calibrated on validation"""
 
 
 class MotionMemory:
@@ -107,15 +104,12 @@ class VelocityNetwork:
 
 
 class Stance(NamedTuple):
-    """Feet that may anchor the root.
-
-    Attributes:
-        load: (4,) probabilities that `FEET` bear load; 0 for feet that may not anchor the root.
-        rest: (4,) probabilities that they rest; 0 likewise.
-    """
+    """Feet that may anchor the root."""
 
     load: Floats
+    """(4,) probabilities that `FEET` bear load; 0 for feet that may not anchor the root"""
     rest: Floats
+    """(4,) probabilities that they rest; 0 likewise"""
 
 
 def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> Stance:

@@ -44,30 +44,26 @@ _FEET, _SOLE_OFFSETS = list(FEET), SOLE[:, None] * [0.0, 0.0, 1.0]
 
 @dataclass(frozen=True)
 class BodyObservation:
-    """A body of one message, in the world.
-
-    Attributes:
-        body: the body in the message, unchanged.
-        stamp_ns: stamp of the message.
-        dt: seconds since the last message with this body; 0 in the first.
-        positions: (22, 3) metres; NaN where unknown.
-        orientation: (4,) xyzw, orientation of the root; the last valid one if the message has none.
-        observed: (22,) whether each joint was observed and not inferred.
-        sigma: (22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none.
-        root_sigma: metres, standard deviation of the root's position; infinite if no observation supports it.
-        pelvis_observed: whether the pelvis or a hip was observed; if not, the prior inferred the root from other
-            joints.
-    """
+    """A body of one message, in the world."""
 
     body: CleanBody
+    """the body in the message, unchanged"""
     stamp_ns: int
+    """stamp of the message"""
     dt: float
+    """seconds since the last message with this body; 0 in the first"""
     positions: Floats
+    """(22, 3) metres; NaN where unknown"""
     orientation: Floats
+    """(4,) xyzw, orientation of the root; the last valid one if the message has none"""
     observed: NDArray[np.bool_]
+    """(22,) whether each joint was observed and not inferred"""
     sigma: Floats
+    """(22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none"""
     root_sigma: float
+    """metres, standard deviation of the root's position; infinite if no observation supports it"""
     pelvis_observed: bool
+    """whether the pelvis or a hip was observed; if not, the prior inferred the root from other joints"""
 
     @property
     def root_known(self) -> bool:

@@ -12,25 +12,22 @@ from steadypose.prior.settings import build_settings, weights_setting
 
 @dataclass(frozen=True)
 class TrajectorySettings:
-    """Settings of the trajectory node.
-
-    Attributes:
-        weights: weight set of the root velocity network, or a path to a ``.safetensors`` file.
-        contact_weights: weight set of the contact network, or a path to a ``.safetensors`` file.
-        network: whether to use the network's root velocity.
-        contacts: whether resting feet stay in place and anchor the root.
-        acceleration: m/s² over √Hz, density of the root's white-noise acceleration.
-        lost_sigma: metres, horizontal standard deviation of the root above which a body counts as LOST.
-        timeout_s: seconds without a message that contains it after which a body is forgotten.
-    """
+    """Settings of the trajectory node."""
 
     weights: str = weights_setting("trajectory")
+    """weight set of the root velocity network, or a path to a ``.safetensors`` file"""
     contact_weights: str = weights_setting("contacts")
+    """weight set of the contact network, or a path to a ``.safetensors`` file"""
     network: bool = True
+    """whether to use the network's root velocity"""
     contacts: bool = True
+    """whether resting feet stay in place and anchor the root"""
     acceleration: float = 3.0
+    """m/s² over √Hz, density of the root's white-noise acceleration"""
     lost_sigma: float = 0.5
+    """metres, horizontal standard deviation of the root above which a body counts as LOST"""
     timeout_s: float = 1.0
+    """seconds without a message that contains it after which a body is forgotten"""
 
     @classmethod
     def from_dict(cls, settings: Mapping[str, Any]) -> TrajectorySettings:

@@ -81,21 +81,18 @@ Use = Literal["default", "research", "measure"]
 
 @dataclass(frozen=True)
 class DataSet:
-    """A source of motion.
-
-    Attributes:
-        name: name of the source.
-        files: regular expression of the names of its files or folders.
-        weights: weights that it may train.
-        read: reads a file or folder.
-        split: assigns a clip to training, validation or test.
-    """
+    """A source of motion."""
 
     name: str
+    """name of the source"""
     files: str
+    """regular expression of the names of its files or folders"""
     weights: Use
+    """weights that it may train"""
     read: Callable[[Path, Progress], Iterator[Clip | Dropped]]
+    """reads a file or folder"""
     split: Callable[[Clip], Split]
+    """assigns a clip to training, validation or test"""
 
     def matches(self, path: Path) -> bool:
         """Whether a file or folder contains it, by its name."""

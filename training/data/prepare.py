@@ -53,27 +53,24 @@ RAISED = 0.12
 
 @dataclass(frozen=True)
 class Prepared:
-    """A recording ready for training.
-
-    Attributes:
-        clip: its joints canonical, at 30 Hz, z up, floor at z = 0.
-        weights: which weights it may train.
-        split: training, validation or test.
-        speed: factor by which it is sped up.
-        offsets: (22, 3) metres, its subject's bones.
-        rotations: (T, 22, 4) local, xyzw.
-        contacts: (T, 8) labels.
-        flat: whether the person stays on the floor; contacts on raised objects are not labelled.
-    """
+    """A recording ready for training."""
 
     clip: Clip
+    """its joints canonical, at 30 Hz, z up, floor at z = 0"""
     weights: Use
+    """which weights it may train"""
     split: Split
+    """training, validation or test"""
     offsets: NDArray[np.float64]
+    """(22, 3) metres, its subject's bones"""
     rotations: NDArray[np.float64]
+    """(T, 22, 4) local, xyzw"""
     contacts: NDArray[np.bool_]
+    """(T, 8) labels"""
     flat: bool
+    """whether the person stays on the floor; contacts on raised objects are not labelled"""
     speed: float = 1.0
+    """factor by which it is sped up"""
 
     def __post_init__(self) -> None:
         if (self.weights, self.split) == ("measure", "train"):

@@ -31,19 +31,16 @@ UNREADABLE = "cannot be read"
 
 @dataclass(frozen=True)
 class Dropped:
-    """A recording, or a part of one, that is excluded from training, with the reason.
-
-    Attributes:
-        name: name of the recording.
-        source: its data set.
-        kind: general cause, for counting.
-        cause: the cause in this case, with its figures.
-    """
+    """A recording, or a part of one, that is excluded from training, with the reason."""
 
     name: str
+    """name of the recording"""
     source: str
+    """its data set"""
     kind: str
+    """general cause, for counting"""
     cause: str
+    """the cause in this case, with its figures"""
 
 
 Progress = Callable[[float], None]

@@ -34,36 +34,30 @@ _ALIGNED = [
 
 @dataclass(frozen=True)
 class Motion:
-    """Recordings in a row, at 30 Hz.
-
-    Attributes:
-        positions: (N, 22, 3) float32 metres, z up.
-        start: (C + 1,) first frame of each recording, and the end.
-        source: (C,) name of the data set.
-        speed: (C,) factor by which the recording is sped up.
-    """
+    """Recordings in a row, at 30 Hz."""
 
     positions: NDArray[np.float32]
+    """(N, 22, 3) float32 metres, z up"""
     start: NDArray[np.int64]
+    """(C + 1,) first frame of each recording, and the end"""
     source: NDArray[np.str_]
+    """(C,) name of the data set"""
     speed: Floats
+    """(C,) factor by which the recording is sped up"""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Recordings of a real Kinect and its ground truth, concatenated, at 30 Hz.
-
-    Attributes:
-        seen: (N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint.
-        truth: (N, 22, 3) metres, from the Vicon, with the Kinect's joint definitions; NaN where unknown.
-        start: (C + 1,) first frame of each recording, and the end.
-        subject: (C,) the person.
-    """
+    """Recordings of a real Kinect and its ground truth, concatenated, at 30 Hz."""
 
     seen: NDArray[np.float32]
+    """(N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint"""
     truth: NDArray[np.float32]
+    """(N, 22, 3) metres, from the Vicon, with the Kinect's joint definitions; NaN where unknown"""
     start: NDArray[np.int64]
+    """(C + 1,) first frame of each recording, and the end"""
     subject: NDArray[np.str_]
+    """(C,) the person"""
 
     def of(self, subjects: Collection[str]) -> Pairs:
         """Return the recordings of these subjects."""

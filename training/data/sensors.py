@@ -44,18 +44,14 @@ _LIMBS = [[J[f"{side}_{n}"] for n in names] for side in ("left", "right") for na
 
 @dataclass(frozen=True)
 class Sensed:
-    """Clips as observed by simulated sensors.
-
-    Attributes:
-        seen: (C, T, 22, 3) metres, NaN where unobserved.
-        truth: (C, T, 22, 3) metres, NaN where unknown.
-        confidence: (C, T, 22) 0 to 1, the sensor's confidence; in 70 % of clips, the noise is inversely proportional to
-            it.
-    """
+    """Clips as observed by simulated sensors."""
 
     seen: Floats
+    """(C, T, 22, 3) metres, NaN where unobserved"""
     truth: Floats
+    """(C, T, 22, 3) metres, NaN where unknown"""
     confidence: Floats
+    """(C, T, 22) 0 to 1, the sensor's confidence; in 70 % of clips, the noise is inversely proportional to it"""
 
 
 class Sensors:

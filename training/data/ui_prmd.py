@@ -29,24 +29,22 @@ class KinectPair:
     """One repetition of a movement, observed by both systems at the same times.
 
     They agree in time but not in space: align them with one rotation and translation per clip.
-
-    Attributes:
-        name: name in the file, such as ``m01_s01_e01``; with ``_inc``, the movement is deliberately incorrect.
-        subject: ``s01`` to ``s08``.
-        movement: ``m01`` to ``m10``.
-        fps: frames per second.
-        kinect: (T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y.
-        vicon: (T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost.
-        markers: (T, 39, 3) metres, the Plug-in-Gait markers, z up; NaN where lost.
     """
 
     name: str
+    """name in the file, such as ``m01_s01_e01``; with ``_inc``, the movement is deliberately incorrect"""
     subject: str
+    """``s01`` to ``s08``"""
     movement: str
+    """``m01`` to ``m10``"""
     fps: float
+    """frames per second"""
     kinect: NDArray[np.float64]
+    """(T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y"""
     vicon: NDArray[np.float64]
+    """(T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost"""
     markers: NDArray[np.float64]
+    """(T, 39, 3) metres, the Plug-in-Gait markers, z up; NaN where lost"""
 
 
 def _metres(counts: NDArray[np.int16]) -> NDArray[np.float64]:

@@ -41,13 +41,10 @@ OUTPUTS = 2 * len(CONTACT_JOINTS)
 
 @dataclass(frozen=True)
 class ContactConfig:
-    """Sizes.
-
-    Attributes:
-        hidden: numbers that the network remembers of a body.
-    """
+    """Sizes."""
 
     hidden: int = 64
+    """numbers that the network remembers of a body"""
 
 
 class ContactNet(nn.Module):
@@ -101,21 +98,18 @@ _FEET = slice(2, 6)
 
 @dataclass(frozen=True)
 class Pool:
-    """Smoothed clips, (C, T, ...).
-
-    Attributes:
-        positions: (C, T, 22, 3) metres, world, float32.
-        sigma: (C, T, 22) metres.
-        yaw: (C, T) radians.
-        load: (C, T, 8) labels.
-        rest: (C, T, 8).
-    """
+    """Smoothed clips, (C, T, ...)."""
 
     positions: NDArray[np.float32]
+    """(C, T, 22, 3) metres, world, float32"""
     sigma: NDArray[np.float32]
+    """(C, T, 22) metres"""
     yaw: NDArray[np.float32]
+    """(C, T) radians"""
     load: NDArray[np.bool_]
+    """(C, T, 8) labels"""
     rest: NDArray[np.bool_]
+    """(C, T, 8)"""
 
 
 def smoothed_clips(motion: MotionSet, count: int, seed: int) -> Pool:

@@ -56,23 +56,20 @@ kernel, twice the dimensions of z_l (for fast motion), and encoding about the me
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Hyperparameters of a VAE of windows.
-
-    Attributes:
-        iterations: number of optimiser steps.
-        batch: windows per step.
-        learning_rate: initial learning rate of Adam; it falls to a third twice.
-        joint_weight: lambda of equation 5.
-        strides: frame strides of windows; each entry has the same probability.
-        speed_weighted: whether windows are speed-weighted: fast motion is drawn more often, large sources less.
-    """
+    """Hyperparameters of a VAE of windows."""
 
     iterations: int
+    """number of optimiser steps"""
     batch: int
+    """windows per step"""
     learning_rate: float
+    """initial learning rate of Adam; it falls to a third twice"""
     joint_weight: float
+    """lambda of equation 5"""
     strides: Sequence[int]
+    """frame strides of windows; each entry has the same probability"""
     speed_weighted: bool
+    """whether windows are speed-weighted: fast motion is drawn more often, large sources less"""
 
 
 # The paper varies the frame rate. Prepared motion has 30 Hz, so its halves and thirds are available. Half of the

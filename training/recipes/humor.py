@@ -60,21 +60,18 @@ fewer degrees of freedom than coordinates; and largest number of expectation-max
 
 @dataclass(frozen=True)
 class Sequences:
-    """Sequences of states, drawn from motion.
-
-    Attributes:
-        motion: N frames of prepared motion.
-        load: (N, 8) whether `CONTACT_JOINTS` bear load.
-        rest: (N, 8) whether they rest.
-        starts: (M,) frames at which a sequence may start.
-        chances: (M,) probabilities of these starts.
-    """
+    """Sequences of states, drawn from motion."""
 
     motion: MotionSet
+    """N frames of prepared motion"""
     load: Tensor
+    """(N, 8) whether `CONTACT_JOINTS` bear load"""
     rest: Tensor
+    """(N, 8) whether they rest"""
     starts: np.ndarray
+    """(M,) frames at which a sequence may start"""
     chances: np.ndarray
+    """(M,) probabilities of these starts"""
 
     @classmethod
     def of(cls, motion: MotionSet) -> Sequences:
@@ -115,17 +112,14 @@ class Sequences:
 
 @dataclass(frozen=True)
 class Batch:
-    """B sequences of T steps.
-
-    Attributes:
-        states: (B, T + 1).
-        offsets: (B, 22, 3) metres.
-        contacts: (B, T, 16) labels of load, then of rest, after each step.
-    """
+    """B sequences of T steps."""
 
     states: State
+    """(B, T + 1)"""
     offsets: Tensor
+    """(B, 22, 3) metres"""
     contacts: Tensor
+    """(B, T, 16) labels of load, then of rest, after each step"""
 
 
 def train_humor(options: TrainingOptions) -> Path:

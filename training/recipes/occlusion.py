@@ -80,13 +80,10 @@ _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
 
 @dataclass(frozen=True)
 class OcclusionConfig:
-    """Sizes.
-
-    Attributes:
-        hidden: of each layer.
-    """
+    """Sizes."""
 
     hidden: int = 96
+    """of each layer"""
 
 
 class OcclusionNet(nn.Module):
@@ -119,19 +116,16 @@ class OcclusionNet(nn.Module):
 
 @dataclass(frozen=True)
 class Rows:
-    """N occluded joints.
-
-    Attributes:
-        features: (N, `FEATURES`) features.
-        joint: (N,) index of the joint.
-        candidates: (N, 4, 3) metres relative to the first candidate.
-        truth: (N, 3) metres, likewise.
-    """
+    """N occluded joints."""
 
     features: NDArray[np.float32]
+    """(N, `FEATURES`) features"""
     joint: NDArray[np.int64]
+    """(N,) index of the joint"""
     candidates: NDArray[np.float32]
+    """(N, 4, 3) metres relative to the first candidate"""
     truth: NDArray[np.float32]
+    """(N, 3) metres, likewise"""
 
 
 def occlusions(truth: Floats, rng: Rng) -> Bools:

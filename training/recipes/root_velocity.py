@@ -102,34 +102,28 @@ _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 
 @dataclass(frozen=True)
 class _Motion:
-    """True motion in B windows of T frames. Positions have one more frame at each end, for central differences.
-
-    Attributes:
-        positions: (B, T + 2, 22, 3) metres, world.
-        yaw: (B, T) radians, heading of the body.
-        contacts: (B, T, 8) labels.
-    """
+    """True motion in B windows of T frames. Positions have one more frame at each end, for central differences."""
 
     positions: Tensor
+    """(B, T + 2, 22, 3) metres, world"""
     yaw: Tensor
+    """(B, T) radians, heading of the body"""
     contacts: Tensor
+    """(B, T, 8) labels"""
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Input and targets of the network.
-
-    Attributes:
-        features: (B, T, FEATURES) input.
-        turn: (B, T, 3, 3) rotations from a frame's heading to the world.
-        velocity: (B, T, 3) m/s, velocity of the root, world.
-        contacts: (B, T, 8) labels.
-    """
+    """Input and targets of the network."""
 
     features: Tensor
+    """(B, T, FEATURES) input"""
     turn: Tensor
+    """(B, T, 3, 3) rotations from a frame's heading to the world"""
     velocity: Tensor
+    """(B, T, 3) m/s, velocity of the root, world"""
     contacts: Tensor
+    """(B, T, 8) labels"""
 
 
 def train_trajectory(options: TrainingOptions) -> Path:

@@ -28,17 +28,14 @@ Links = Mapping[str, tuple[Floats, Floats]]
 
 
 class Link(NamedTuple):
-    """A link of REP-155 and its counterpart in the canonical skeleton.
-
-    Attributes:
-        origin: joint at which it begins.
-        turned_by: joint whose rotation it has.
-        rest: (3, 3) rotation in the T pose of the canonical skeleton.
-    """
+    """A link of REP-155 and its counterpart in the canonical skeleton."""
 
     origin: int
+    """joint at which it begins"""
     turned_by: int
+    """joint whose rotation it has"""
     rest: Floats
+    """(3, 3) rotation in the T pose of the canonical skeleton"""
 
 
 def _links() -> dict[str, Link]:

@@ -24,41 +24,35 @@ class Level(NamedTuple):
 
 @dataclass(frozen=True)
 class CompletionConfig:
-    """Sizes of the completion network.
-
-    Attributes:
-        patch: frames in a node; a window consists of whole patches.
-        features: number of features of each node.
-        blocks: number of graph convolutional blocks between the input and the output layer.
-    """
+    """Sizes of the completion network."""
 
     patch: int = 5
+    """frames in a node; a window consists of whole patches"""
     features: int = 256
+    """number of features of each node"""
     blocks: int = 4
+    """number of graph convolutional blocks between the input and the output layer"""
 
 
 @dataclass(frozen=True)
 class HGVAEConfig:
-    """The sizes of an HG-VAE.
-
-    Attributes:
-        frames: T, frames of a window at 30 Hz (paper: 50).
-        coefficients: number of coefficients of the cosine transform that are kept, lowest first (paper: all T).
-        features: F, features of every node in the deterministic streams (paper: 256).
-        levels: stochastic levels, top level first (paper: 1, 8, 24 and 54 nodes).
-        stochastic: number of random levels, counted from the bottom. Levels above stay at their prior's mean and carry
-            no information (table 1: depth at equal capacity). None means all levels.
-        actions: number of action classes, given one-hot beside the top latent; 0 for a model without actions.
-        completion: sizes of the completion network; None for a model without one.
-    """
+    """The sizes of an HG-VAE."""
 
     frames: int = 50
+    """T, frames of a window at 30 Hz (paper: 50)"""
     coefficients: int = 20
+    """number of coefficients of the cosine transform that are kept, lowest first (paper: all T)"""
     features: int = 64
+    """F, features of every node in the deterministic streams (paper: 256)"""
     levels: tuple[Level, ...] = (Level(1, 64), Level(8, 32), Level(24, 32), Level(JOINT_NODES, 16))
+    """stochastic levels, top level first (paper: 1, 8, 24 and 54 nodes)"""
     stochastic: int | None = None
+    """number of random levels, counted from the bottom. Levels above stay at their prior's mean and carry no
+    information (table 1: depth at equal capacity). None means all levels"""
     actions: int = 0
+    """number of action classes, given one-hot beside the top latent; 0 for a model without actions"""
     completion: CompletionConfig | None = None
+    """sizes of the completion network; None for a model without one"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:
@@ -73,15 +67,12 @@ class HGVAEConfig:
 
 @dataclass(frozen=True)
 class FaultNetConfig:
-    """Sizes of the fault network.
-
-    Attributes:
-        frames: T, frames of HG-VAE's window.
-        features: number of features of each of its 66 nodes.
-    """
+    """Sizes of the fault network."""
 
     frames: int = 50
+    """T, frames of HG-VAE's window"""
     features: int = 48
+    """number of features of each of its 66 nodes"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> FaultNetConfig:

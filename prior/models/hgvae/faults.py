@@ -126,13 +126,10 @@ class LiveFaultNet:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Scores of clean windows, by missing joints, sensor error and pace.
-
-    Attributes:
-        quantiles: (M, S, P, R) quantiles of the window's score at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`.
-    """
+    """Scores of clean windows, by missing joints, sensor error and pace."""
 
     quantiles: Floats
+    """(M, S, P, R) quantiles of the window's score at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`"""
 
     @classmethod
     def load(cls, weights: str) -> Calibration:

@@ -15,15 +15,12 @@ from steadypose.prior.models.weights import Arrays, load_weights, part
 
 
 class Reconstruction(NamedTuple):
-    """The distribution p(x | z) of windows.
-
-    Attributes:
-        mean: (..., 66, T) metres of a body of standard size, tracks.
-        sigma: (..., 66, T) metres, standard deviations.
-    """
+    """The distribution p(x | z) of windows."""
 
     mean: NDArray[np.float64]
+    """(..., 66, T) metres of a body of standard size, tracks"""
     sigma: NDArray[np.float64]
+    """(..., 66, T) metres, standard deviations"""
 
 
 class LiveHGVAE:
