@@ -21,7 +21,7 @@ ENOUGH = 15
 """Smallest number of messages to judge by."""
 SIZES = (0.5, 1.4)
 """Range of body sizes relative to an adult, from a child of three to the tallest adult."""
-UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "kilometres": 0.001}
+UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "metres divided by 1000": 0.001}
 ADULT_M = 1.72
 UPRIGHT, ALONG = 0.5, 0.85
 """Cosines of the body's up direction: with the vertical, above which it counts as upright; with an axis of its frame,

@@ -26,6 +26,8 @@ from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centre
 from steadypose.prior.npz import open_npz
 
 POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
+SMALLEST_M = 0.1
+"""Distance from the origin that some point of a person exceeds, metres."""
 
 
 @dataclass(frozen=True)
@@ -210,6 +212,11 @@ def _c3d(content: bytes, description: Description) -> _Read:
 def _points(fps: float, names: Sequence[str], points: Floats, units: str, description: Description) -> _Read:
     """Read named points, which are skin markers of the Plug-in-Gait set or joints."""
     metres = description.metres or POINT_UNITS.get(units.strip().lower(), 0.001)
+    if not description.metres and 0 < metres * np.nanmax(np.abs(points), initial=0.0) < SMALLEST_M:
+        raise MotionError(
+            f"in its unit, {units}, all points are within {SMALLEST_M} m of the origin: the numbers seem to be metres; "
+            f"if so, say metres = 1.0 with {BY_RIG}"
+        )
     if description.canonical:
         return fps, _described(names, description.canonical), points * metres, ""
     if set(MARKERS) <= set(names):

@@ -154,6 +154,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "a camera that leans": (LEANING, "not_upright", "docs/calibrate.md"),
     "millimetres": (scaled(1000), "unit", "divide by 1000"),
     "centimetres": (scaled(100), "unit", "divide by 100"),
+    "metres taken for millimetres": (scaled(0.001), "unit", "metres divided by 1000, expected"),
     "feet": (scaled(3.281), "unit", "divide by 3.281"),
     "coordinates of an image from 0 to 1": (scaled(0.3), "unit", "world coordinates"),
     "key points of an image, z 0": (scaled(1, 0, 1), "flat", "from_coco"),

@@ -18,7 +18,7 @@ from steadypose.prior.body.rigs import RigError, recognise_points
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
 from steadypose.prior.mocap.clip import MotionError
 from steadypose.prior.mocap.files import Description, read_motion
-from steadypose.prior.mocap.plug_in_gait import calibrate, joint_centres
+from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
 
 HALPE = {
     "Hip": "pelvis", "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle", "RBigToe": "right_foot",
@@ -93,6 +93,16 @@ def test_a_c3d_is_of_joints_or_of_markers_on_the_skin(tmp_path: Path) -> None:
     millimetres = 1000 * np.stack(list(markers.values()), axis=1)
     _, body = read_motion("x.c3d", c3d(tmp_path / "x.c3d", list(markers), millimetres))
     np.testing.assert_allclose(body, joint_centres(markers, calibrate([markers])), atol=1e-4)
+
+
+def test_metres_under_a_header_of_millimetres_are_named(tmp_path: Path) -> None:
+    """Markers as well: with a joint's width of centimetres beside them, no body would be left to be measured."""
+    for names in (list(HALPE), [*MARKERS]):
+        content = c3d(tmp_path / "x.c3d", names, np.ones((4, len(names), 3)))
+        with pytest.raises(MotionError, match=r"unit, mm, .* seem to be metres; .* metres = 1\.0 with .*--rig"):
+            read_motion("x.c3d", content)
+    _, body = read_motion("x.c3d", c3d(tmp_path / "x.c3d", list(HALPE), points()), Description(metres=1.0))
+    np.testing.assert_allclose(body[:, J["head"]], points()[:, list(HALPE).index("Head")], atol=1e-4)
 
 
 def test_points_are_known_by_side_and_part_however_they_are_written() -> None:
