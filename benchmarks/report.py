@@ -16,6 +16,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from steadypose.benchmarks.overview import overview
 from steadypose.benchmarks.provenance import RESULTS, ROOT
 from steadypose.benchmarks.results import load
 from steadypose.benchmarks.stale import STALE
@@ -32,6 +33,60 @@ gone from here. Positions are in millimetres, accelerations in mm/frame² at 30 
 Baselines are tuned on every third of the clips that are scored, with other noise; steadypose runs as it ships and has
 nothing to tune.
 """
+
+CHAPTERS = {
+    "Observed joints": {
+        "fidelity": "Independent noise",
+        "noisy_joints": "Noise of several kinds",
+        "kinect_vicon": "Kinect",
+        "mediapipe": "MediaPipe",
+        "layouts": "Layouts",
+        "camera_rates": "Camera rates",
+        "streaming": "Streaming",
+        "ablations": "What each part brings",
+    },
+    "Joints that are not observed": {
+        "hidden_joints": "Hidden joints",
+        "counter": "Behind a counter",
+        "completion": "Completion",
+        "interpolation": "Gaps",
+        "interpolation_paths": "The root in gaps",
+    },
+    "Rotations, world, events": {
+        "rotations": "Rotations",
+        "heading": "Heading",
+        "world": "World",
+        "simulated": "Bundled streams",
+        "contacts": "Contacts",
+        "factor_graph": "Factor graph",
+        "retarget": "Retargeting",
+        "events": "Events",
+        "event_mocap": "Events in motion capture",
+        "identity": "Identity",
+    },
+    "Speed and faults": {
+        "latency": "Latency",
+        "scale": "Scale",
+        "restart": "Restart",
+        "soak": "Soak",
+        "memory": "Memory",
+        "fuzz": "Damaged input",
+        "web_page": "Browser",
+    },
+    "Sensors and files": {
+        "calibration": "Calibration",
+        "depth_lifting": "Depth lifting",
+        "importers": "Importers",
+    },
+    "The papers": {
+        "hgvae": "HG-VAE",
+        "hgvae_training": "HG-VAE, trained in variants",
+        "reconstruction": "HM-VAE",
+        "humor": "HuMoR",
+        "humor_credit": "What HuMoR brings to a fit",
+    },
+}
+"""The page's chapters: results by name, each with its title."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +132,22 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[s
 
 
 def page(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """Return all tables and pictures, by study."""
-    parts = [HOW]
-    for name, result in results.items():
-        parts.append(f"\n## {name.replace('_', ' ').capitalize()}\n")
-        parts += [f"\n{markdown(table, result, reasons.get(name))}" for table in result["tables"]]
-        parts += [f"\n![{stem.replace('_', ' ')}](images/{stem}.png)\n" for stem in result.get("pictures", ())]
+    """Return an overview, then all tables and pictures by chapter.
+
+    Raises:
+        KeyError: no chapter names a result.
+    """
+    titles = {name: title for chapter in CHAPTERS.values() for name, title in chapter.items()}
+    if unnamed := results.keys() - titles.keys():
+        raise KeyError(f"results {', '.join(sorted(unnamed))}: name them in a chapter of benchmarks/report.py")
+    parts = [HOW, overview(results, titles)]
+    for chapter, studies in CHAPTERS.items():
+        parts.append(f"\n## {chapter}\n")
+        for name, title in studies.items():
+            if result := results.get(name):
+                parts.append(f"\n### {title}\n")
+                parts += [f"\n{markdown(table, result, reasons.get(name))}" for table in result["tables"]]
+                parts += [f"\n![{stem.replace('_', ' ')}](images/{stem}.png)\n" for stem in result.get("pictures", ())]
     return "".join(parts)
 
 

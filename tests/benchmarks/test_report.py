@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from steadypose.benchmarks import output, provenance
+from steadypose.benchmarks.overview import ERRORS, overview, ratios
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
 from steadypose.benchmarks.report import Args, fill, main, page
 from steadypose.benchmarks.results import PICTURES, Study, Table, load, save
@@ -72,9 +73,56 @@ def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: 
 
 def test_the_page_shows_a_studys_pictures_and_each_is_there(tmp_path: Path) -> None:
     result = saved(tmp_path) | {"pictures": ["noise_levels"]}
-    assert "![noise levels](images/noise_levels.png)" in page({"noisy_joints": result})
+    assert "![noise levels](images/noise_levels.png)" in page({"latency": result})
     shown = {stem for one in load().values() for stem in one.get("pictures", ())}
     assert shown == {path.stem for path in PICTURES.glob("*_*.png")}
+
+
+def test_the_page_refuses_a_result_that_no_chapter_names(tmp_path: Path) -> None:
+    with pytest.raises(KeyError, match=r"new_study.*chapter"):
+        page({"new_study": saved(tmp_path)})
+
+
+def record(method: str, delay: int, position: float, acceleration: float, condition: str = "2 cm") -> dict[str, Any]:
+    return {"method": method, "delay": delay, "condition": condition,
+            "position_mm": position, "acceleration_mm": acceleration}  # fmt: skip
+
+
+def test_the_overview_compares_with_the_nearest_baseline_of_the_cell_that_waits_no_longer() -> None:
+    records = [
+        record("raw", 0, 16.0, 40.0),
+        record("bank", 0, 10.0, 8.0),
+        record("bank", 4, 20.0, 1.0),
+        record("bank", 8, 1.0, 1.0),
+        record("bank", 0, 1.0, 1.0, "1 cm"),
+        record("Butterworth, offline", -1, 1.0, 1.0),
+        record("HM-VAE", 4, 1.0, 1.0),
+        record("temporal convolution", 4, 1.0, 1.0),
+        record("steadypose", 4, 12.0, 4.0),
+        record("steadypose", 0, 9.0, 8.0),
+    ]
+    assert list(ratios(records, "position_mm")) == [("2 cm, delay 4", 1.2, 0.5), ("2 cm, delay 0", 0.9, 1.0)]
+    shown = overview({"fidelity": {"records": records}}, {"fidelity": "Noise"})
+    assert "| Noise | 2 | 1 | 1.05 | 1.20 (2 cm, delay 4) | 0 | 0.75 | 1.00 (2 cm, delay 0) |" in shown
+
+
+def test_the_readme_says_in_how_many_cells_a_baseline_is_nearer() -> None:
+    cells = {
+        (study, name): position
+        for study, error in ERRORS.items()
+        for name, position, _ in ratios(load()[study]["records"], error)
+    }
+    worse = {cell: ratio for cell, ratio in cells.items() if ratio >= 1.005}
+    assert {study for study, _ in worse} == {"mediapipe"}
+    percent = round(100 * max(worse.values()) - 100)
+    text = " ".join((ROOT / "README.md").read_text().split())
+    assert f"Of {len(cells)} cells" in text
+    assert f"is nearer in {len(worse)}, all MediaPipe's, by up to {percent} %" in text
+
+
+def test_two_errors_that_are_next_to_nothing_are_equal() -> None:
+    records = [record("raw", 0, 0.0, 0.0), record("steadypose", 0, 0.04, 0.01)]
+    assert list(ratios(records, "position_mm")) == [("2 cm, delay 0", 1.0, 1.0)]
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
