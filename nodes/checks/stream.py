@@ -27,8 +27,9 @@ CHECKS = 3
 class Answers:
     """Counts the pipeline's input and output between two checks, beside the pipeline's own counters."""
 
-    def __init__(self, counters: Counter[str]) -> None:
+    def __init__(self, counters: Counter[str], *, identified: bool) -> None:
         self._counters = counters
+        self._if_ids_switch = "" if identified else "if ids switch between people, --set prior.identify.enabled=true; "
         self._refused_before = 0
         self._flagged_checks = 0
         self._forget()
@@ -51,8 +52,7 @@ class Answers:
                 warning(
                     "nearly_all_refused",
                     f"{100 * refused / self._joints:.0f} % of the joints seen were refused as jumps: expected a few; "
-                    "if ids switch between people, --set prior.identify.enabled=true; if stamps are times of arrival, "
-                    "use times of capture",
+                    f"{self._if_ids_switch}if stamps are times of arrival, use times of capture",
                 )
             )
         nearly_all = self._out >= ENOUGH and self._flagged > MAX_SHARE * self._out

@@ -52,7 +52,7 @@ class PriorNode(Node):
             self._pipeline = StreamBatch(settings, clients) if clients else PriorPipeline(settings)
         self._bodies = 0
         self._anomalies = 0
-        self._answers = Answers(self._pipeline.counters)
+        self._answers = Answers(self._pipeline.counters, identified=settings.identify.enabled)
         self._checks = StreamChecks(
             settings.max_bodies,
             identified=settings.identify.enabled,

@@ -355,9 +355,10 @@ def test_the_page_has_every_cause() -> None:
     }
 
 
-def test_answers_that_are_of_no_use() -> None:
+@pytest.mark.parametrize("identified", [False, True])
+def test_answers_that_are_of_no_use(identified: bool) -> None:
     counters: Counter[str] = Counter()
-    answers = Answers(counters)
+    answers = Answers(counters, identified=identified)
     good = walk(1.0)
     for raw in good:
         answers.asked(raw)
@@ -365,7 +366,9 @@ def test_answers_that_are_of_no_use() -> None:
     for raw in good:
         answers.asked(raw)
         counters["joints_refused"] += 18
-    assert [problem.cause for problem in answers.problems()] == ["nearly_all_refused"]
+    (problem,) = answers.problems()
+    assert problem.cause == "nearly_all_refused"
+    assert ("prior.identify.enabled=true" in problem.text) == (not identified), "of use only where it is off"
     flagged = clean_body(np.zeros((22, 3)), anomaly=5.0, anomaly_flag=True)
 
     def flag_all() -> None:
