@@ -115,11 +115,7 @@ def markdown(table: Mapping[str, Any], result: Mapping[str, Any], reason: str | 
 
 
 def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """Replace every block between markers.
-
-    Raises:
-        KeyError: a marker names a table that no result has.
-    """
+    """Replace every block between markers. Raises KeyError if a marker names a table that no result has."""
     tables = {t["name"]: markdown(t, r, reasons.get(name)) for name, r in results.items() for t in r["tables"]}
 
     def block(match: re.Match[str]) -> str:

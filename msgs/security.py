@@ -31,11 +31,7 @@ class TransportError(ValueError):
 
 
 def parse(endpoint: str) -> tuple[str, str]:
-    """The transport, and the path or host, of an address.
-
-    Raises:
-        TransportError: the address is malformed.
-    """
+    """The transport, and the path or host, of an address. Raises TransportError if the address is malformed."""
     transport, _, address = endpoint.partition("://")
     host, _, port = address.rpartition(":")
     if transport == "ipc" and address:
@@ -162,11 +158,7 @@ class Keys:
     """directory that the keys were read from"""
 
     def server_at(self, endpoint: str) -> bytes:
-        """The public key of the publisher at an address.
-
-        Raises:
-            ValueError: there is no key for its host.
-        """
+        """The public key of the publisher at an address. Raises ValueError if there is no key for its host."""
         _, host = parse(endpoint)
         if host in self.servers:
             return self.servers[host]
@@ -202,11 +194,7 @@ class ClientList:
 
 
 def _listed(directory: Path) -> dict[str, bytes]:
-    """Public keys in a folder, by file name without suffix.
-
-    Raises:
-        ValueError: a file is not a key.
-    """
+    """Public keys in a folder, by file name without suffix. Raises ValueError if a file is not a key."""
     return {file.stem: _public(file) for file in sorted(directory.glob("*.key"))}
 
 

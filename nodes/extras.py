@@ -41,11 +41,7 @@ EXTRAS: Mapping[str, Extra] = {
 
 
 def require_extra(name: str) -> None:
-    """Check that an extra is installed.
-
-    Raises:
-        LaunchError: a module of the extra is not installed.
-    """
+    """Check that an extra is installed. Raises LaunchError if a module of the extra is not installed."""
     missing = [module for module in EXTRAS[name].modules if find_spec(module) is None]
     if missing:
         raise LaunchError(how_to_install(missing, name))

@@ -106,11 +106,7 @@ def weights_setting(model: str, default: str = "default") -> Any:
 
 
 def check_range(name: str, value: float, least: float, most: float) -> None:
-    """Check that a value lies in a range.
-
-    Raises:
-        ValueError: it does not.
-    """
+    """Check that a value lies in a range. Raises ValueError if it does not."""
     if not least <= value <= most:
         raise ValueError(f"{name}: expected {least:g} to {most:g}, got {value:g}")
 

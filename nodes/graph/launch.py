@@ -155,11 +155,7 @@ def _layout(table: Mapping[str, Any]) -> type:
 
 
 def read_toml(file: Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        LaunchError: the file cannot be read, or is not TOML.
-    """
+    """Read a TOML file. Raises LaunchError if the file cannot be read, or is not TOML."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -33,11 +33,7 @@ class RunLock(Closing):
     """
 
     def __init__(self, launch: Launch) -> None:
-        """Take the locks.
-
-        Raises:
-            LaunchError: another run uses one of the addresses.
-        """
+        """Take the locks. Raises LaunchError if another run uses one of the addresses."""
         directory = launch.transport.make_ipc_directory()
         self.has_health = True
         with ExitStack() as stack:

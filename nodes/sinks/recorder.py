@@ -84,11 +84,7 @@ class RecorderSettings:
 
 
 def check_recorder(launch: Launch) -> None:
-    """Check the settings.
-
-    Raises:
-        LaunchError: no directory is set.
-    """
+    """Check the settings. Raises LaunchError if no directory is set."""
     if not launch.settings(RecorderSettings).directory:
         raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
 

@@ -56,11 +56,7 @@ class RetargetSettings(DatagramSettings):
 
 
 def check_retarget(launch: Launch) -> None:
-    """Check that the robot's URDF can be used.
-
-    Raises:
-        LaunchError: no URDF is set, or it cannot be used.
-    """
+    """Check that the robot's URDF can be used. Raises LaunchError if no URDF is set, or it cannot be used."""
     settings = launch.settings(RetargetSettings)
     if not settings.urdf:
         raise LaunchError("[retarget] urdf: expected the robot's URDF file, got none")

@@ -122,11 +122,7 @@ class CameraSource(LiveSource):
 
 
 def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
-    """Create the source for an OAK camera.
-
-    Raises:
-        LaunchError: a setting cannot be used.
-    """
+    """Create the source for an OAK camera. Raises LaunchError if a setting cannot be used."""
     if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
         raise LaunchError(
             f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "

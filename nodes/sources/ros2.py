@@ -246,11 +246,7 @@ class Ros2Settings:
 
 
 class Ros2Source(LiveSource):
-    """Skeletons from a topic of ``MarkerArray`` or ``PoseArray``.
-
-    Raises:
-        LaunchError: the skeleton is unknown.
-    """
+    """Skeletons from a topic of ``MarkerArray`` or ``PoseArray``. Raises LaunchError if the skeleton is unknown."""
 
     def __init__(self, settings: Ros2Settings, context: SourceContext) -> None:
         super().__init__()

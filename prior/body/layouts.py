@@ -67,11 +67,7 @@ class Skeleton:
     """canonical joints that are only about where the table has them"""
 
     def index(self, joint: str) -> int:
-        """Index of a sensor joint by name.
-
-        Raises:
-            KeyError: the skeleton has no such joint.
-        """
+        """Index of a sensor joint by name. Raises KeyError if the skeleton has no such joint."""
         try:
             return self.joints.index(joint)
         except ValueError:
@@ -173,11 +169,7 @@ def _texts(value: object) -> list[str]:
 
 
 def get_skeleton(name: str) -> Skeleton:
-    """Return the skeleton of this name.
-
-    Raises:
-        KeyError: the name is unknown; the message lists the known ones.
-    """
+    """Return the skeleton of this name. Raises KeyError if the name is unknown; the message lists the known ones."""
     try:
         return SKELETONS[name]
     except KeyError:

@@ -111,11 +111,7 @@ class _Bone:
 
 @documented
 def read_asf(text: str) -> Asf:
-    """Read an Acclaim skeleton.
-
-    Raises:
-        MotionError: a section is missing or cannot be read.
-    """
+    """Read an Acclaim skeleton. Raises MotionError if a section is missing or cannot be read."""
     sections = _sections(text)
     for name in ("units", "root", "bonedata", "hierarchy"):
         if name not in sections:

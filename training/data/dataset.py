@@ -96,11 +96,7 @@ class MotionSet:
         return len(self.rotations) / FPS / 3600
 
     def only(self, clips: NDArray[np.bool_]) -> MotionSet:
-        """Select these clips (C,).
-
-        Raises:
-            ValueError: none is selected.
-        """
+        """Select these clips (C,). Raises ValueError if none is selected."""
         if not clips.any():
             raise ValueError(f"expected at least one of {len(clips)} clips, none is wanted")
         frames = np.concatenate([np.arange(*self.clip_start[c : c + 2]) for c in np.flatnonzero(clips)])

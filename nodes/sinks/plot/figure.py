@@ -57,11 +57,7 @@ def save(figure: Figure, output: Path) -> None:
 
 
 def draw(history: History, body: int | None = None) -> Figure:
-    """Draw one body of a recording, and the paths of all bodies over the floor.
-
-    Raises:
-        PlotError: as in `body_of`.
-    """
+    """Draw one body of a recording, and the paths of all bodies over the floor. Raises PlotError as in `body_of`."""
     from matplotlib.figure import Figure
 
     chosen, bodies = body_of(history, body), history.bodies
