@@ -41,11 +41,8 @@ class Interval(NamedTuple):
 
 
 def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> NDArray[np.float64]:
-    """Return the mean of each person's clips (P,), in alphabetical order. People without values are left out.
-
-    Args:
-        values: (N,) one per clip; NaN where a clip has none.
-        people: (N,) person of each clip.
+    """Return the mean of each person's clips (P,), in alphabetical order; ``values`` (N,), NaN where a clip has none,
+    and ``people`` (N,) have one entry per clip. People without values are left out.
     """
     values, people = np.asarray(values, dtype=np.float64), np.asarray(people)
     known = np.isfinite(values)

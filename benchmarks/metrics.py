@@ -25,11 +25,8 @@ def acceleration_error(estimate: Floats, truth: Floats) -> Floats:
 
 
 def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> float:
-    """Return the variation of bone lengths: standard deviation over time by mean length, averaged over bones.
-
-    Args:
-        positions: (T, J, 3) metres.
-        bones: pairs of joint indices.
+    """Return the variation of the lengths of ``bones`` (pairs of joints) of positions (T, J, 3): standard deviation
+    over time by mean length, averaged over bones.
     """
     ends, starts = np.array(bones).T
     lengths = np.linalg.norm(positions[:, ends] - positions[:, starts], axis=-1)
@@ -92,12 +89,8 @@ def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
 
 
 def sigma_ratio(error: Floats, sigma: Floats) -> float:
-    """Return the error-to-sigma ratio: the root mean square of error over sigma, along an axis. It is 1 when
-    calibrated.
-
-    Args:
-        error: (...) metres, distances in space.
-        sigma: (...) metres, along an axis. Entries with infinite sigma or NaN error are left out.
+    """Return the error-to-sigma ratio, 1 when calibrated: the root mean square of ``error`` (distance in space) over
+    ``sigma``, along an axis. Entries with infinite sigma or NaN error are left out.
     """
     ratio = error / sigma / np.sqrt(3)
     known = np.isfinite(ratio) & np.isfinite(sigma)
@@ -143,10 +136,8 @@ def npss(estimate: Floats, truth: Floats) -> float:
 
 
 def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
-    """Return the trunk's axes forward, left and up as columns: (..., 3, 3). Up runs from the hips to the shoulders.
-
-    Args:
-        left_hip, right_hip, left_shoulder, right_shoulder: (..., 3) metres.
+    """Return the trunk's axes forward, left and up as columns: (..., 3, 3), of joints (..., 3). Up runs from the hips
+    to the shoulders.
     """
     up = left_shoulder + right_shoulder - left_hip - right_hip
     up = up / np.linalg.norm(up, axis=-1, keepdims=True)

@@ -64,11 +64,8 @@ def score(answer: Floats, truth: Floats, hidden: NDArray[np.bool_], align: bool 
 
 
 def figures(scores: Scores, people: NDArray[np.str_] | None = None) -> dict[str, Any]:
-    """Return means over clips: mm, mm/frame², m/s², per cent.
-
-    Args:
-        scores: scores of C clips.
-        people: (C,) person of each clip, for the 95 % intervals over people of the main figures.
+    """Return means over C clips: mm, mm/frame², m/s², per cent; with 95 % intervals over ``people`` (C,) of the main
+    figures.
     """
     deciding = {"position": scores.position, "hidden": scores.hidden, "acceleration": scores.acceleration_error}
     intervals = {} if people is None else {f"{name}_ci_mm": ends_mm(v, people) for name, v in deciding.items()}

@@ -119,11 +119,9 @@ class _Progress:
 
 
 class Deliveries:
-    """Keeps a publisher's messages until its reliable subscribers have acknowledged them.
+    """Keeps a publisher's messages until the reliable subscribers ``names`` have acknowledged them.
 
-    Args:
-        names: names of the reliable subscribers.
-        sequence: sequence number of each topic's next message, for a publisher that resumes a predecessor's stream.
+    ``sequence`` is the number of each topic's next message, for a publisher that resumes a predecessor's stream.
     """
 
     def __init__(self, names: Collection[str], sequence: Mapping[str, int]) -> None:

@@ -111,11 +111,8 @@ class Diagnosis:
         return new
 
     def answer(self, asked: int, given: int) -> list[str]:
-        """Add that no frame, or less than half of them, gave a pose, unless a problem is the reason. Returns as `look`.
-
-        Args:
-            asked: number of frames at 30 Hz in which the input has a body.
-            given: number of those in which the output has one.
+        """Add that the output has a body in none, or in less than half, of the 30 Hz frames in which the input has one
+        (``given`` of ``asked``), unless a problem is the reason. Returns as `look`.
         """
         if not self.trusted or 0 < given >= asked / 2:
             return []

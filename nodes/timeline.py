@@ -38,11 +38,7 @@ _MOMENTS = (EventKind.ENTERED, EventKind.LEFT)
 
 
 class FrameEvents:
-    """Detects the events of each frame of one stream, with begin and end.
-
-    Args:
-        settings: the thresholds.
-    """
+    """Detects the events of each frame of one stream, with begin and end."""
 
     def __init__(self, settings: EventSettings | None = None) -> None:
         self._detector = EventDetector(settings)
@@ -83,11 +79,7 @@ class FrameEvents:
 
 
 class EventTimeline:
-    """Collects the events of one stream.
-
-    Args:
-        settings: the thresholds.
-    """
+    """Collects the events of one stream."""
 
     def __init__(self, settings: EventSettings | None = None) -> None:
         self._frames = FrameEvents(settings)

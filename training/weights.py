@@ -44,15 +44,10 @@ def write_card(path: Path, card: Mapping[str, Any]) -> None:
 
 
 def install(path: Path) -> Path:
-    """Copy weights, and the files that belong to them, to the folder where nodes look for a weight set.
+    """Copy the weights ``MODEL-SET.safetensors`` of a training run, and the files that belong to them, to the folder
+    where nodes look for a weight set; returns their new path.
 
     Replaced files are moved to the folder ``previous`` there.
-
-    Args:
-        path: ``MODEL-SET.safetensors`` in the folder of a training run.
-
-    Returns:
-        Their new path.
     """
     folder = weights_io.WEIGHTS
     (folder / "previous").mkdir(parents=True, exist_ok=True)

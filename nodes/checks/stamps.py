@@ -33,12 +33,7 @@ SETTLED = 8
 
 
 def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem]:
-    """Problems with the stamps of a window.
-
-    Args:
-        arrivals: the window.
-        live: whether stamps should be close to the present; False for a replay.
-    """
+    """Problems with the stamps of a window; if ``live``, they should also be close to the present."""
     if len(arrivals) < ENOUGH:
         return
     stamps = np.array([arrival.raw.stamp_ns for arrival in arrivals])

@@ -47,9 +47,7 @@ _NEAREST = ("state", "anomaly_flag")
 class NpzCollector:
     """Collects the output of both pipelines on the 30 Hz grid, and interpolates it at the stamps of the input.
 
-    Args:
-        messages: the output.
-        bodies: ids of the input's axis of bodies, if it has one. The arrays then have the same axis.
+    ``bodies`` are the ids of the input's axis of bodies, if it has one; the arrays then have the same axis.
     """
 
     def __init__(self, messages: Iterable[tuple[str, Message]] = (), bodies: Iterable[int] = ()) -> None:

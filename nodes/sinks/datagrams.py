@@ -42,13 +42,8 @@ class DatagramSettings:
 
 
 class Followed:
-    """Selects one person to follow until they are gone, then the next.
-
-    Args:
-        body: id of the only person to follow; None: the first one present.
-
-    Attributes:
-        id: id of the followed person; None until there was anybody.
+    """Selects one person to follow until they are gone, then the next; or only ``body``. ``id`` is None until there was
+    anybody.
     """
 
     def __init__(self, body: int | None = None) -> None:

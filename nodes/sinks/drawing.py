@@ -34,16 +34,11 @@ CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
 
 
 def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """The bones to draw between the canonical joints that a sensor can observe.
+    """(B, 2) parent and child of the bones to draw between the canonical joints that a sensor has, ``observable``
+    (22,).
 
     A joint that the sensor's skeleton lacks is skipped, and its children are connected to its nearest ancestor. For a
     joint that is missing only temporarily, leave out its bones instead.
-
-    Args:
-        observable: (22,) the canonical joints that the sensor's skeleton has.
-
-    Returns:
-        (B, 2) canonical indices of parent and child.
     """
     pairs = []
     for child in range(len(JOINTS)):

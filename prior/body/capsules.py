@@ -45,17 +45,11 @@ _STATURE = [
 
 
 def random_offsets(rng: np.random.Generator, height: float) -> Floats:
-    """Draw the bones of a random adult, equal on both sides.
+    """Draw the bones of a random adult of stature ``height`` (metres), equal on both sides: (22, 3) metres, each joint
+    in its parent's frame in the rest pose.
 
     Legs, arms and trunk vary about the generic proportions by 3 % each, and every bone by another 1.5 % (standard
     deviations, clipped at two of them).
-
-    Args:
-        rng: random generator for the proportions.
-        height: stature, metres.
-
-    Returns:
-        (22, 3) metres, each joint in its parent's frame in the rest pose.
     """
     trunk, arms, legs = 1.0 + 0.03 * np.clip(rng.standard_normal(3), -2, 2)
     own = 1.0 + 0.015 * np.clip(rng.standard_normal(len(JOINTS)), -2, 2)

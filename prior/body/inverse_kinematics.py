@@ -157,11 +157,8 @@ def fit_lengths(
 
 
 def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
-    """Forward kinematics without gradients: positions (..., 22, 3) metres, with the root at the origin.
-
-    Args:
-        rotations: (..., 22, 3, 3) local.
-        offsets: (22, 3) or (..., 22, 3) metres.
+    """Forward kinematics without gradients: positions (..., 22, 3) metres, with the root at the origin, of local
+    rotations (..., 22, 3, 3) and offsets (22, 3) or (..., 22, 3) metres.
     """
     bones = _frames(offsets, shape := np.shape(rotations)[:-1])
     placed = np.empty_like(bones)

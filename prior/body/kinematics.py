@@ -241,12 +241,7 @@ def _rotation_vectors(rotations, vectors):
 def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """Return the rotation R (3, 3) and translation t (3,) that minimise the sum of |R source + t - target|².
 
-    Args:
-        source: (..., 3) metres; points that are not finite in both arrays are ignored.
-        target: the same shape.
-
-    Raises:
-        ValueError: fewer than three points are finite in both.
+    Points (..., 3) that are not finite in both arrays are ignored. Raises ValueError if fewer than three are left.
     """
     both = finite_joints(source) & finite_joints(target)
     a, b = source[both], target[both]

@@ -60,14 +60,8 @@ class Likeness:
 
 
 def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | None:
-    """Measure how well joints fit a human body in the order of a layout.
-
-    Args:
-        skeleton: the layout, with J joints.
-        positions: (T, J, 3) of one or several bodies, any unit and frame; NaN where missing.
-
-    Returns:
-        The fit; None if too few joints were observed.
+    """Measure how well joints (T, J, 3), of any unit and frame and NaN where missing, fit a human body in the order of
+    a layout of J joints. None if too few joints were observed.
     """
     joints, _ = to_canonical(skeleton, positions.astype(np.float64))
     lengths = np.linalg.norm(joints[:, SPANS[:, 0]] - joints[:, SPANS[:, 1]], axis=-1)
@@ -108,14 +102,8 @@ class Stance:
 
 
 def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None:
-    """Estimate the up axis and handedness of a stream.
-
-    Args:
-        skeleton: the layout, with J joints.
-        positions: (T, J, 3) any unit, NaN where missing.
-
-    Returns:
-        The estimate; None if it is impossible, or if the up axis changes.
+    """Estimate the up axis and handedness of joints (T, J, 3) in a layout of J joints, of any unit, NaN where missing.
+    None if it is impossible, or if the up axis changes.
     """
     positions = positions.astype(np.float64)
     joints, _ = to_canonical(skeleton, positions)

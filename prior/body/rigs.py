@@ -168,10 +168,8 @@ def recognise(tree: Tree, name: str = "file") -> Rig:
 
 
 def up_axis(bodies: Floats) -> str:
-    """Return the axis that points up, ``y``, ``-y`` or ``z``: the one along which heads are farthest from ankles.
-
-    Args:
-        bodies: (T, 22, 3) canonical joints in a file's axes; NaN where missing.
+    """Return the axis that points up in a file's joints (T, 22, 3), NaN where missing: ``y``, ``-y`` or ``z``, along
+    which heads are farthest from ankles.
     """
     upwards = bodies[:, J["head"]] - bodies[:, [J["left_ankle"], J["right_ankle"]]].mean(axis=1)
     known = upwards[np.isfinite(upwards).all(axis=1)]

@@ -66,11 +66,8 @@ class _Stream:
 
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):
-    """The prior for many streams, which are distinguished by their messages' ``source``.
-
-    Args:
-        settings: settings of the prior; ``max_bodies`` limits all streams together.
-        max_streams: largest number of streams; further ones are refused.
+    """The prior for many streams, at most ``max_streams``, which are distinguished by their messages' ``source``.
+    ``settings.max_bodies`` limits all of them together.
     """
 
     def __init__(self, settings: PriorSettings, max_streams: int) -> None:

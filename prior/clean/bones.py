@@ -155,14 +155,10 @@ class SensorBias(NamedTuple):
 
 
 class BiasEstimator:
-    """Keeps, for each body, running moments of the lengths of the segments of `RIGID`.
+    """Keeps running moments of the lengths of the segments of `RIGID`, for each of ``slots`` bodies.
 
-    Args:
-        bias_sigma: metres along an axis, upper bound of the expected bias.
-        slots: number of bodies.
-
-    Attributes:
-        bias_sigma: (S,) metres along an axis, the latest estimate.
+    ``bias_sigma`` is an upper bound of the expected bias, metres along an axis; the attribute (S,) is the latest
+    estimate.
     """
 
     def __init__(self, bias_sigma: float, slots: int) -> None:

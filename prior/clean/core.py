@@ -158,11 +158,8 @@ class CleanCore:
             self._newest = self._newest._replace(present=self._newest.present & ~slot)
 
     def note_published(self, frame: CleanFrame, published: Collection[int]) -> None:
-        """Reset bodies that have been observed for `UNPUBLISHED_S` without a publishable estimate.
-
-        Args:
-            frame: as returned by `step`.
-            published: slots of the bodies that were published.
+        """Reset bodies that have been observed for `UNPUBLISHED_S` without a publishable estimate; ``published`` are
+        the slots of the bodies in ``frame`` that were published.
         """
         missed: Bools = np.asarray(np.isfinite(frame.observed).any(axis=(1, 2)))
         missed[list(published)] = False

@@ -15,11 +15,8 @@ from steadypose.prior.clean.frame import Estimate
 
 
 def mix(estimate: Estimate, unseen_s: Floats) -> Estimate:
-    """Return the estimate with means in place of joints that were never observed; rotations stay.
-
-    Args:
-        estimate: of one frame.
-        unseen_s: (S, 22) seconds since each joint was last observed, inf if never.
+    """Return a frame's estimate with means in place of joints that were never observed, by the seconds (S, 22) since
+    each was (inf if never); rotations stay.
     """
     lacking = np.isinf(unseen_s) & np.isfinite(estimate.positions[:, :1, 0])
     if not (mixed := mixtures.mixed(lacking)).any():

@@ -171,13 +171,11 @@ def _attribute(bad):
 
 @njit(cache=True)
 def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(B, 22) joints that the tracker lost and for which it repeats its last output.
+    """(B, 22) joints of a sensor's output (B, T, 22, 3) that the tracker lost and for which it repeats its last output;
+    NaN where it has none, and the last frames count.
 
     A frozen joint repeats itself in most of the frames in which the body as a whole does not, while other joints
     jitter.
-
-    Args:
-        positions: (B, T, 22, 3) metres, the sensor's output, NaN where it has none; the last frames count.
     """
     count, frames, joints, _ = positions.shape
     found = np.zeros((count, joints), dtype=np.bool_)

@@ -80,11 +80,8 @@ class Reconstruct:
 
 
 class Denoise:
-    """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction.
-
-    Args:
-        delay_frames: frames between the newest frame and the published one.
-        slots: maximum number of bodies.
+    """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction, ``delay_frames`` behind the
+    newest frame.
     """
 
     def __init__(self, delay_frames: int, slots: int) -> None:

@@ -84,11 +84,7 @@ class Correct:
 
 
 class DepthError:
-    """Estimates the depth error of each body, from mean bone lengths and the moments of the fit.
-
-    Args:
-        slots: number of bodies.
-    """
+    """Estimates the depth error of each body, from mean bone lengths and the moments of the fit."""
 
     def __init__(self, slots: int) -> None:
         self._frames, self._length = np.zeros((2, slots, _BONES))
@@ -102,11 +98,8 @@ class DepthError:
         self._total[:, slot] = 0.0
 
     def update(self, smoothed: Smoothed | None, white: Floats) -> Floats:
-        """Add a smoothed frame and return the standard deviation (S,) that its deviations omit, metres along an axis.
-
-        Args:
-            smoothed: joints and their deviations; None if there is no estimate yet.
-            white: (S,) share of the noise that is white, which the deviations include in full.
+        """Add a smoothed frame, if there is one, and return the standard deviation (S,) that its deviations omit,
+        metres along an axis. ``white`` (S,) is the share of the noise that is white, which they include in full.
         """
         if smoothed is None:
             return np.zeros(len(white))

@@ -259,11 +259,8 @@ def _clean_messages(
 
 
 def root_steps(completion: Completion, weights: str) -> dict[tuple[int, int], Floats]:
-    """Return displacements (3,) metres, by id and grid frame, of bodies that are known only relative to their root.
-
-    Args:
-        completion: the completion of a recording.
-        weights: weight set of the root velocity network.
+    """Return displacements (3,) metres, by id and grid frame, of bodies that are known only relative to their root;
+    ``weights`` are those of the root velocity network.
     """
     steps: dict[tuple[int, int], Floats] = {}
     if not completion.centred:
@@ -332,13 +329,10 @@ def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats)
 
 
 def bridge(network: LiveRootVelocity, joints: Floats, root_rotations: Floats, ends: Floats) -> Floats:
-    """Return the root's path (K, 3) metres, world, over the last K frames between two known ends.
+    """Return the root's path (K, 3) metres, world, over the last K of T frames, between the first and last row of
+    ``ends`` (K, 3); the other arguments are those of `velocities`.
 
     The closing error of the integrated velocities is distributed evenly over the frames.
-
-    Args:
-        network, joints, root_rotations: as in `velocities`, for T frames.
-        ends: (K, 3) metres, world, positions in the last K of the T frames; only the first and last row are used.
     """
     steps = velocities(network, joints, root_rotations)[-len(ends) :] * FRAME_S
     way = np.cumsum(steps, axis=0)

@@ -163,12 +163,10 @@ class Wave:
 
 
 class RandomWalk:
-    """A random-walk Kalman filter of a quantity that a sensor shakes by more than people change it.
+    """A random-walk Kalman filter of a quantity that a sensor shakes by more than people change it, ``change`` (RMS) in
+    one second.
 
     All coordinates are filtered alike. The more accurate the observations, the less it averages.
-
-    Args:
-        change: RMS change of a coordinate in one second, in its unit.
     """
 
     def __init__(self, change: float) -> None:

@@ -110,11 +110,8 @@ def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[See
 
 
 def track_of(seen: Seen, points: Floats | None) -> Track:
-    """Build the track to fit of a body, starting from ``pose/clean``.
-
-    Args:
-        seen: the body.
-        points: (T, N, 3) metres, world, points of its surface, padded with NaN; None if there are none.
+    """Build the track to fit of a body, starting from ``pose/clean``; ``points`` (T, N, 3) metres, world, are of its
+    surface, padded with NaN.
     """
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     floor = 0.0 if seen.calibrated else lowest_floor(positions)

@@ -146,11 +146,7 @@ def _kl(mean: Tensor, log_var: Tensor) -> Tensor:
 
 
 class MotionVAE(nn.Module, ABC):
-    """A VAE of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation).
-
-    Args:
-        window: frames T.
-    """
+    """A VAE of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation), T = ``window``."""
 
     def __init__(self, window: int) -> None:
         super().__init__()

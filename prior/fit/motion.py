@@ -68,12 +68,7 @@ class Variables:
 
 
 class Motion:
-    """Quantities that follow from variables, each computed once for all terms of the energy.
-
-    Args:
-        model: the transition model.
-        variables: the variables.
-    """
+    """Quantities that follow from variables, each computed once for all terms of the energy."""
 
     def __init__(self, model: HumorNet, variables: Variables) -> None:
         self.model, self.variables = model, variables

@@ -54,14 +54,8 @@ def from_6d(x: Tensor) -> Tensor:
 
 
 def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
-    """Turn windows about the vertical so that the body faces +x in ``frame``.
-
-    Args:
-        rotations: (B, T, 22, 3, 3) local, z up.
-        frame: the frame of the window that defines the heading.
-
-    Returns:
-        The turned rotations, and the yaw matrices (B, 3, 3) that turn them back.
+    """Turn windows of local rotations (B, T, 22, 3, 3), z up, about the vertical so that the body faces +x in
+    ``frame``. Returns them, and the yaw matrices (B, 3, 3) that turn them back.
     """
     back = yaw_rotation(heading(rotations[:, frame, 0]))
     turned = rotations.clone()

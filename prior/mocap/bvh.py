@@ -83,10 +83,8 @@ class Bvh:
 
     @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:
-        """(T, J, 3) positions in the file's unit and axes, by forward kinematics.
-
-        Args:
-            lost_bones: see `prior.body.rigs.Rig`; these bones get their length back if the file has none.
+        """(T, J, 3) positions in the file's unit and axes, by forward kinematics; ``lost_bones``
+        (`prior.body.rigs.Rig`) get their length back if the file has none.
         """
         offsets = self.offsets.copy()
         for name, multiple in (lost_bones or {}).items():

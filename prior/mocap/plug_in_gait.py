@@ -162,11 +162,8 @@ def _below(joint: str, place: Array, m: Markers) -> Array:
 
 
 def calibrate(recordings: Iterable[Markers]) -> Calibration:
-    """Measure a subject on all of its recordings.
-
-    Args:
-        recordings: for each, marker name -> (T, 3) metres, z up, NaN where lost. The more the subject moves,
-            the better the axes.
+    """Measure a subject on all of its recordings, of markers (T, 3) metres by name, z up, NaN where lost. The more the
+    subject moves, the better the axes.
     """
     recordings = list(recordings)
     joined = {name: np.concatenate([r[name] for r in recordings]) for name in recordings[0]}
@@ -209,14 +206,8 @@ def _bend_axis(joint: str, upper: Array, m: Markers) -> float:
 
 
 def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
-    """Canonical joints from markers.
-
-    Args:
-        m: marker name -> (T, 3) metres, z up, NaN where lost.
-        calibration: of the same subject.
-
-    Returns:
-        (T, 22, 3) metres in the frame of the markers; NaN where a marker that the joint needs is lost.
+    """Canonical joints (T, 22, 3) metres from a subject's markers (T, 3) metres by name, z up, NaN where lost; NaN
+    where a marker that the joint needs is lost.
     """
     p: dict[str, Array] = {}
     p["left_hip"], p["right_hip"], p["pelvis"] = _hips(m, calibration)

@@ -108,11 +108,8 @@ class Program:
 
 
 class Network:
-    """A program with memory for its matrices.
-
-    Args:
-        program: the recorded network; later changes to it have no effect.
-        max_batch: largest number of windows, each in its row.
+    """A program with memory for its matrices, for ``max_batch`` windows, each in its row. Later changes to the program
+    have no effect.
     """
 
     def __init__(self, program: Program, max_batch: int) -> None:

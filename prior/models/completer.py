@@ -40,14 +40,10 @@ class LiveCompleter:
         return cls(CompleterConfig.from_dict(config), arrays)
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
-        """Complete windows. Known joints do not change.
+        """Complete windows (B, T, 22, 3) metres, z up, NaN where unknown, of bones (B, 22, 3) metres. Known joints do
+        not change.
 
-        Args:
-            positions: (B, T, 22, 3) metres, z up; NaN where unknown.
-            offsets: (B, 22, 3) metres, the person's bones.
-
-        Returns:
-            Local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres.
+        Returns local rotations (B, T, 22, 3, 3) and positions of the root (B, T, 3), metres.
         """
         window = read_window(positions, offsets, self.usual)
         output = self.forward(window.features).astype(np.float64)

@@ -52,14 +52,9 @@ def leaky_relu(x: Floats32) -> Floats32:
 
 
 class LiveRecurrent:
-    """A trained network of torch's ``GRU`` and ``Linear``.
+    """A trained network of torch's ``GRU``, named ``unit`` in the state dict, and ``Linear``, named ``head``.
 
-    Args:
-        weights: its state dict, with the linear layer as ``head``.
-        unit: name of the GRU in the state dict.
-
-    Attributes:
-        hidden: size of a body's hidden state, which is zero before the first frame.
+    ``hidden`` is the size of a body's hidden state, which is zero before the first frame.
     """
 
     def __init__(self, weights: Arrays, unit: str) -> None:

@@ -75,12 +75,8 @@ class Expected(NamedTuple):
 class LivePosture:
     """The Gaussian of `steadypose train posture`.
 
-    Args:
-        weights: its mean and the factor of its covariance.
-        spread: factor on that covariance: how much more people may differ from the mean than training people do.
-
-    Attributes:
-        covariance: (66, 66) of the joints of an adult in the trunk's frame, m².
+    ``spread`` is a factor on its covariance: how much more people may differ from the mean than training people do.
+    ``covariance`` (66, 66) is of the joints of an adult in the trunk's frame, m².
     """
 
     def __init__(self, weights: Arrays, spread: float = 1.0) -> None:
@@ -143,11 +139,7 @@ def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: 
 
 
 class RootCovariance:
-    """Computes the covariance of a root's orientation from published joints and deviations; messages do not carry it.
-
-    Args:
-        weights: weight set of the posture, or a path to a ``.safetensors`` file.
-    """
+    """Computes the covariance of a root's orientation, which messages do not carry, from published joints and deviations."""
 
     def __init__(self, weights: str = "default") -> None:
         self._posture = LivePosture.load(weights)

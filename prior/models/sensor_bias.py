@@ -93,12 +93,7 @@ def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class LiveCorrection:
-    """A trained `CorrectionNet`.
-
-    Args:
-        weights: its state dict, which is copied.
-        max_batch: largest number of frames per call.
-    """
+    """A trained `CorrectionNet` for at most ``max_batch`` frames per call."""
 
     def __init__(self, weights: Arrays, max_batch: int) -> None:
         p = Program()

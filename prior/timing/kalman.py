@@ -48,11 +48,8 @@ class ConstantVelocityFilter:
         self._stamp_s: float | None = None
 
     def update(self, positions: ArrayLike, stamp_s: float) -> Smoothed:
-        """Process a frame and return its estimate.
-
-        Args:
-            positions: (..., 3) metres, non-finite where missing.
-            stamp_s: time of capture, seconds, increasing.
+        """Process a frame (..., 3) metres, non-finite where missing, of an increasing stamp in seconds; returns its
+        estimate.
         """
         measured = np.array(positions, dtype=np.float64)
         if self._stamp_s is None:

@@ -52,9 +52,8 @@ def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating
 def turn_legs(rotations: NDArray[np.floating], positions: Floats, moved: Floats) -> Floats:
     """Return local rotations (22, 4) xyzw after legs have moved, with the smallest rotation of each bone.
 
-    Args:
-        rotations: (22, 4) that match ``positions``. A leg with a missing rotation or position keeps its rotations.
-        positions, moved: (22, 3) metres, before and after, in the frame of the root's rotation.
+    ``positions`` and ``moved`` (22, 3) metres are before and after, in the frame of the root's rotation. A leg with a
+    missing rotation or position keeps its rotations.
     """
     turned = np.array(rotations, dtype=np.float64, order="C")
     _turn(turned, np.ascontiguousarray(positions, dtype=np.float64), np.ascontiguousarray(moved))

@@ -73,12 +73,7 @@ class RootState:
 
 
 class RootFilter:
-    """Fuses observations and predictions of one body's root and feet.
-
-    Args:
-        first: the body's first observation with a root.
-        noise: process noise of root and feet.
-    """
+    """Fuses observations and predictions of one body's root and feet, from its first observation with a root on."""
 
     def __init__(self, first: BodyObservation, noise: BodyNoise) -> None:
         self._noise, self._before = noise, first

@@ -66,13 +66,8 @@ class MotionMemory:
 
 
 class VelocityNetwork:
-    """Predicts the root velocity of all bodies of a message at once.
-
-    Args:
-        weights: the weight set, or a path to a ``.safetensors`` file.
-
-    Attributes:
-        memory_s: (3,) seconds, time constants of the velocity's errors.
+    """Predicts the root velocity of all bodies of a message at once. ``memory_s`` (3,) are time constants of its
+    errors.
     """
 
     def __init__(self, weights: str) -> None:
@@ -131,11 +126,7 @@ class ContactMemory:
 
 
 class ContactNetwork:
-    """Predicts the contacts of all bodies of a message at once.
-
-    Args:
-        weights: the weight set, or a path to a ``.safetensors`` file.
-    """
+    """Predicts the contacts of all bodies of a message at once."""
 
     def __init__(self, weights: str) -> None:
         self._net = LiveContacts.load(weights)

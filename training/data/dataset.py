@@ -130,12 +130,8 @@ class MotionSet:
 
 
 class SpeedWeightedWindows:
-    """Draws windows of motion with weights that grow with speed, and each source by the square root of its size.
-
-    Otherwise, a large source of ten exercises would outweigh all others.
-
-    Args:
-        motion: the clips; without given sources, they count as one source.
+    """Draws windows of motion with weights that grow with speed, and each source by the square root of its size: a
+    large source of ten exercises would outweigh all others. Without given sources, all clips are one.
     """
 
     def __init__(self, motion: MotionSet) -> None:

@@ -149,12 +149,7 @@ def _label(clip: Clip, weights: Use, split: Split, speed: float) -> Prepared:
 
 
 def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """Interpolate joints linearly that are lost for at most `MAX_GAP`; longer gaps stay NaN.
-
-    Args:
-        positions: (T, J, 3), NaN where lost.
-        fps: frames per second.
-    """
+    """Interpolate joints (T, J, 3) linearly that are lost (NaN) for at most `MAX_GAP`; longer gaps stay NaN."""
     filled = positions.copy()
     lost = ~finite_joints(positions)
     time = np.arange(len(positions))

@@ -54,12 +54,7 @@ def _metres(counts: NDArray[np.int16]) -> NDArray[np.float64]:
 def load_pairs(path: Path, subjects: Collection[str]) -> list[KinectPair]:
     """Read some subjects' recordings from ``ui_prmd.npz``, ordered by subject, movement, repetition.
 
-    Args:
-        path: the archive.
-        subjects: such as `TRAIN_SUBJECTS`.
-
-    Raises:
-        MotionError: the file is not this archive, or lacks a subject.
+    Raises MotionError if the file is not this archive, or lacks a subject.
     """
     with open_npz(path, "fps", "vicon_names") as archive:
         marker_names = [str(n) for n in archive["vicon_names"]]

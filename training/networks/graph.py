@@ -133,13 +133,10 @@ class CompletionNet(nn.Module):
 
 
 def certainty_of(observed: Tensor, log_var: Tensor) -> Tensor:
-    """(B, 66, T) certainty of a completed window's entries, for HG-VAE's encoder.
+    """(B, 66, T) certainty of a completed window's entries, for HG-VAE's encoder: 1 where ``observed`` (B, 66, T) is
+    more than 0, and s² / (s² + variance) where completed.
 
-    It is s² / (s² + variance) where completed, with s = `HALF_CERTAIN_SIGMA`, and 1 where observed.
-
-    Args:
-        observed: (B, 66, T) more than 0 where observed.
-        log_var: (B, 22, T) of completed joints, in units of `SCALE`.
+    s is `HALF_CERTAIN_SIGMA`; ``log_var`` (B, 22, T) is of completed joints, in units of `SCALE`.
     """
     completed = torch.sigmoid(2 * math.log(HALF_CERTAIN_SIGMA / SCALE) - log_var)
     return torch.where(observed > 0, 1.0, completed.repeat_interleave(3, dim=1))

@@ -128,11 +128,9 @@ def draw_completion(completion: Completion, title: str) -> Figure:
 
 
 def draw_misfit(fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> Figure:
-    """Draw the distances between fitted and observed joints.
+    """Draw the distances between fitted and observed joints, in ``unit``.
 
-    Args:
-        fits: for each body its id, stamps (T,) in nanoseconds, and distances (T, 22); the fourth entry is not used.
-        unit: unit of the distances.
+    Each of ``fits`` has a body's id, stamps (T,) in nanoseconds, and distances (T, 22); its fourth entry is not used.
     """
     from matplotlib.figure import Figure
 

@@ -187,11 +187,8 @@ def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Flo
 
 
 def decimals(score: Floats, limits: Floats) -> Floats:
-    """Return -log10 of the rate at which clean windows score at least as high.
-
-    Args:
-        score: (B, K) scores of windows or of their joints.
-        limits: (B, R) from `Calibration.limits`.
+    """Return -log10 of the rate at which clean windows score at least as high as ``score`` (B, K), by limits (B, R) of
+    `Calibration.limits`.
     """
     anomaly = np.empty(score.shape)
     _decimals(score, limits, -np.log10(RATES), anomaly)

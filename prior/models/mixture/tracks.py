@@ -45,9 +45,6 @@ def body_covariance(name: str = "default") -> Floats:
 
     Six of its eigenvectors explain five sixths of it. It is equal for x, y and z, so that it does not depend on the
     body's heading. It is learned from training motion (`training.recipes.moments`).
-
-    Args:
-        name: a weight set or a path, as in `load_weights`.
     """
     covariance = load_weights(name, "body_modes")[0]["covariance"].astype(np.float64)
     covariance.flags.writeable = False
