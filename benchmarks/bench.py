@@ -43,13 +43,8 @@ def loss(figures: Mapping[str, float]) -> float:
 def search(
     space: Mapping[str, tuple[float, float]], evaluate: Callable[[Parameters], dict[str, float]], budget: int
 ) -> Tuned:
-    """Search parameters: two thirds of the budget evenly over the space (Sobol), the rest within a quarter of its width
-    around the best.
-
-    Args:
-        space: range of each parameter, searched in its logarithm.
-        evaluate: maps parameters to figures, including ``position_mm`` and ``acceleration_mm``.
-        budget: number of evaluations; one if there are no parameters.
+    """Search parameters: two thirds of the budget evenly over the logarithms of ``space`` (Sobol), the rest within a
+    quarter of its width around the best. ``evaluate`` gives figures, including ``position_mm`` and ``acceleration_mm``.
     """
     if not space:
         return Tuned({}, [evaluate({})])

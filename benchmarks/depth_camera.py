@@ -55,13 +55,8 @@ class Stereo:
 
 
 def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
-    """Return the depth (H, W) of an empty room, metres.
-
-    Args:
-        camera: the camera.
-        height: height of the camera above the floor, metres.
-        pitch: angle by which it looks down, radians.
-        wall: distance from the camera to the wall that it faces, metres.
+    """Return the depth (H, W) of an empty room, metres, for a camera ``height`` metres above the floor that looks down
+    by ``pitch`` radians at a ``wall`` so many metres away.
     """
     rays = _rays(camera)
     ahead = np.array([0.0, -np.sin(pitch), np.cos(pitch)])  # level, optical frame
@@ -72,16 +67,10 @@ def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
 
 
 def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: Floats) -> Floats:
-    """Render the depth of people in front of a background, without errors.
+    """Render the depth (H, W) of people in front of a background (H, W), metres along the optical axis, without errors.
 
-    Args:
-        people: for each, joints (22, 3) metres in the optical frame, and bones (22, 3), which determine the limbs'
-            radii.
-        camera: the camera.
-        background: (H, W) metres.
-
-    Returns:
-        (H, W) metres along the optical axis.
+    Each of the people has joints (22, 3) metres in the optical frame, and bones (22, 3), which determine the limbs'
+    radii.
     """
     depth = background.copy()
     rays = _rays(camera)

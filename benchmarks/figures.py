@@ -38,15 +38,9 @@ _CENTIMETRES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 def curves(
     records: Sequence[Mapping[str, Any]], x: str, panels: Mapping[str, str], label: str, title: str, log: bool = False
 ) -> Figure:
-    """Plot a panel for each figure, with a line for each method.
+    """Plot a panel for each figure, with a line for each method of the records.
 
-    Args:
-        records: records with ``method``, ``x`` and the panels' keys.
-        x: key of the horizontal axis.
-        panels: keys of the vertical axes, with their labels.
-        label: label of the horizontal axis.
-        title: title of the plot.
-        log: whether both axes are logarithmic.
+    ``x`` is the records' key of the horizontal axis, ``panels`` those of the vertical axes with their labels.
     """
     figure = Figure(figsize=(4.6 * len(panels) + 1.8, 3.9), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -51,25 +51,13 @@ def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) ->
 
 
 def interval(values: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
-    """Return the mean over people and its 95 % interval.
-
-    Args:
-        values: (N,) one per clip; NaN where a clip has none.
-        people: (N,) person of each clip.
-        seed: seed of the draws.
-    """
+    """Return the mean over people of clips' values (N,), NaN where a clip has none, and its 95 % interval."""
     return _interval(people_means(values, people), seed)
 
 
 def ratio(values: ArrayLike, baseline: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
-    """Return the ratio of two methods on the same clips, with its interval: the geometric mean of the people's own
-    ratios.
-
-    Args:
-        values: (N,) one per clip, above zero.
-        baseline: (N,) values of the other method; a clip counts if both have a value.
-        people: (N,) person of each clip.
-        seed: seed of the draws.
+    """Return the ratio of two methods' values (N,), above zero, on the same clips, with its interval: the geometric
+    mean of the people's own ratios. A clip counts if both have a value.
     """
     values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     both = np.isfinite(values) & np.isfinite(baseline)

@@ -34,14 +34,10 @@ def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> flo
 
 
 def contact_speed(positions: Floats, contact: NDArray[np.bool_], stamps_s: Floats) -> Floats:
-    """Return the horizontal speed of joints in contact in both frames, m/s: (T-1, J), else NaN.
+    """Return the horizontal speed of joints (T, J, 3) metres, z up, in contact (T, J) in both frames, m/s: (T-1, J),
+    else NaN.
 
     Each foot counts separately. The mean is the foot skate.
-
-    Args:
-        positions: (T, J, 3) metres, z up.
-        contact: (T, J).
-        stamps_s: (T,) seconds.
     """
     speed = np.linalg.norm(np.diff(positions[..., :2], axis=0), axis=-1) / np.diff(stamps_s)[:, None]
     return np.where(contact[1:] & contact[:-1], speed, np.nan)

@@ -150,14 +150,10 @@ def source_table(
     clips: MotionClips,
     baseline: str,
 ) -> Table:
-    """Build a table with a column for each source, the mean over people, and its ratio to a baseline.
+    """Build a table with a column for each source, the mean over people, and its ratio to ``baseline`` in the same
+    condition.
 
-    Args:
-        name: name of the table.
-        title: what is measured, in millimetres.
-        errors: by condition and method, (C,) metres, NaN for a clip without such an error.
-        clips: the clips.
-        baseline: method whose error is the denominator of the last column, in the same condition.
+    ``errors`` are (C,) metres by condition and method, NaN for a clip without such an error.
     """
     sources = list(dict.fromkeys(clips.data_set.tolist()))
     rows = []

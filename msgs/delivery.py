@@ -262,12 +262,8 @@ class Principals:
     def admits(self, topic: str, source: str, publisher: int, connection: object, *, ended: bool = False) -> bool:
         """Whether a message comes from the publisher that its source is bound to.
 
-        Args:
-            topic: the message's topic.
-            source: the message's source.
-            publisher: number of the message's publisher.
-            connection: identity of a subscriber to a single address; None for a subscriber to several.
-            ended: whether the stream ends with this message, which releases its source.
+        ``connection`` is the identity of a subscriber to a single address, None for one to several. If the stream has
+        ``ended`` with this message, its source is released.
         """
         now_s, key = time.monotonic(), (topic, source)
         bound = self._bound.get(key)

@@ -44,24 +44,16 @@ def path_setting(metadata: Mapping[str, Any] = MappingProxyType({}), bundled: st
 
 
 def located(name: str, folder: Path, bundled: str) -> Path:
-    """The path of a file: ``name`` relative to ``folder``, or else the file of that name that is in the package.
-
-    Args:
-        name: path or name; ``~`` is the home folder.
-        folder: the folder that relative paths are relative to.
-        bundled: a folder of this package, such as ``sim_data``; empty if its files have no names.
+    """The path of a file: ``name`` (``~`` is the home folder) relative to ``folder``, or else the file of that name in
+    the package's folder ``bundled``, if that is not empty.
     """
     path, own = folder / Path(name).expanduser(), PACKAGE / bundled / name
     return own if bundled and Path(name).name == name and own.exists() and not path.exists() else path
 
 
 def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
-    """Make the paths in a launch file's table absolute, in place.
-
-    Args:
-        settings: the table's dataclass; nested dataclasses are its sections.
-        table: the parsed TOML table.
-        folder: the folder that paths are relative to.
+    """Make the paths in a launch file's table, of the dataclass ``settings``, absolute, in place: they are relative to
+    ``folder``.
     """
     for setting in fields(settings):
         value = table.get(setting.name)

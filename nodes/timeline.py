@@ -48,14 +48,10 @@ class FrameEvents:
     def update(
         self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False
     ) -> list[TimedEvent]:
-        """Return the events that begin, hold or end with the next message of ``pose/world``.
+        """Return the events that begin, hold or end with the next message of ``pose/world``; the arguments are those of
+        `EventDetector.update`.
 
         An event holds until it is seen to have ended, so also while its body is hidden for a moment.
-
-        Args:
-            world: the message.
-            sensor: as of `EventDetector.update`.
-            calibrated: as of `EventDetector.update`.
         """
         now = world.stamp_ns
         if world.end_of_stream or now <= self._stamp_ns:

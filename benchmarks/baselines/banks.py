@@ -44,13 +44,7 @@ _THIRD = np.sqrt(20.0)
 
 
 def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
-
-    Args:
-        seen: (T, ..., J, 3) metres, NaN where missing; J joints of a body.
-        stamps_s: (T,) seconds.
-        delay: frames.
-    """
+    """Estimate each frame (..., J, 3) metres, NaN where missing, given those up to ``delay`` later, or to the end."""
     frames, joints = len(seen), seen.shape[1:-1]
     sigma = noise_found(seen)
     found = [smooth(seen, stamps_s, delay, 2, density, sigma) for density in JOINT_DENSITIES]
@@ -83,15 +77,9 @@ def noise_found(seen: Floats) -> Floats:
 
 
 def whole_body_bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
+    """Estimate each frame (..., 22, 3) metres, NaN where missing, given those up to ``delay`` later, or to the end.
 
-    Args:
-        seen: (T, ..., 22, 3) metres, canonical joints of a body, NaN where missing.
-        stamps_s: (T,) seconds.
-        delay: frames.
-
-    Raises:
-        ValueError: there are other joints; the compiled loops would write past the ends of their arrays.
+    Raises ValueError for other joints: the compiled loops would write past the ends of their arrays.
     """
     if seen.shape[-2:] != (len(PARENT), 3):
         raise ValueError(f"expected (..., {len(PARENT)}, 3) canonical joints of a body, got {seen.shape}")

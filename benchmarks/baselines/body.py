@@ -19,16 +19,12 @@ _ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "sho
 
 
 def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Hold hidden joints in the body frame; observed joints are returned as they are.
+    """Hold hidden joints (NaN) of (T, C, 22, 3) metres, z up, in the body frame; observed joints are returned as they
+    are.
 
     A hidden joint keeps its last offset, rotated with the trunk, from the nearest visible joint: the one with the
     fewest bones between them and, of several, the nearest in space. Without any visible joint, all are held. A joint
     never observed has the offset of a generic adult who stands with the arms down.
-
-    Args:
-        seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
-        stamps_s: (T,) seconds.
-        delay: frames; not used.
     """
     answers = seen.copy()
     clips, joints = seen.shape[1:3]

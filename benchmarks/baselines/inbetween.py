@@ -123,12 +123,8 @@ class NearestPose:
         self._bank = _about_root(motion.positions[rows].numpy(), facing).astype(np.float32)
 
     def __call__(self, positions: Floats, truth_yaw: Floats, hidden: Sequence[int]) -> Floats:
-        """Fill the joints ``hidden`` of clips (C, T, 22, 3), about the known root.
-
-        Args:
-            positions: metres, NaN where hidden.
-            truth_yaw: (C,) heading in the first frame, radians.
-            hidden: indices of the hidden joints.
+        """Fill the joints ``hidden`` of clips (C, T, 22, 3) metres, about the known root; ``truth_yaw`` (C,) radians is
+        the heading in the first frame.
         """
         seen = np.setdiff1d(np.arange(22), hidden)
         query = _about_root(positions[:, :: self.EVERY], truth_yaw)[:, :, seen]

@@ -36,14 +36,10 @@ class WholeBody(NamedTuple):
 
 
 def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float, damping: float) -> Floats:
-    """Return the input, with hidden joints estimated by the filter from the measurements up to their own frame.
+    """Return joints (T, C, 22, 3) metres, z up, with hidden ones (NaN) estimated by the filter from the measurements up
+    to their own frame.
 
-    Args:
-        seen: (T, C, 22, 3) metres, z up, canonical joints, NaN where missing.
-        stamps_s: (T,) seconds.
-        delay: frames; not used.
-        density: mean process density of the joints, m²/s³.
-        damping: damping of velocities, 1/s.
+    ``density`` is the mean process density of the joints, m²/s³, ``damping`` that of velocities, 1/s.
     """
     answers, clips, sigma = beside(seen, stamps_s, delay), seen.shape[1], np.full(22, MIN_SIGMA)
     first = np.diag(np.repeat(np.square([FIRST_PLACE, FIRST_SPEED]), 22))
@@ -60,17 +56,11 @@ def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float
 
 @njit(cache=True)
 def _step(state, slot, measured, sigma, modes, dt, density, damping):
-    """Predict a body's state, and update it by each measured joint in turn.
+    """Predict a body's state by ``dt`` seconds, and update it by each measured joint (22, 3) metres, NaN if missing, in
+    turn.
 
-    Args:
-        state: a `WholeBody`.
-        slot: index of the body.
-        measured: (22, 3) metres, NaN for joints without a measurement.
-        sigma: (22,) metres along an axis.
-        modes: (22, 22) covariance of joint accelerations, of mean variance 1.
-        dt: seconds since the last step.
-        density: process density, m²/s³.
-        damping: damping of velocities, 1/s.
+    ``sigma`` (22,) is in metres along an axis, ``modes`` (22, 22) is the covariance of joint accelerations, of mean
+    variance 1; the rest as in `whole_body_kalman`.
     """
     mean, covariance, joints = state.mean[slot], state.covariance[slot], 22
     kept = math.exp(-damping * dt)

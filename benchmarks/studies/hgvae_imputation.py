@@ -76,16 +76,10 @@ CONDITIONS: Mapping[str, Callable[[tuple[int, int], np.random.Generator], Mask]]
 def impute_all(
     model: HGVAE, positions: Floats, sizes: Floats, masks: Mask, steps: tuple[int, ...]
 ) -> dict[str, tuple[Floats, Floats]]:
-    """Run every method over windows.
+    """Run every method over complete windows (B, T, 22, 3) metres of bodies of these sizes (B,), with the entries
+    ``masks`` (B, 66, T) hidden; ``steps`` are those of the paper's gradient ascent.
 
-    Args:
-        positions: (B, T, 22, 3) metres, complete.
-        sizes: (B,) sizes of the bodies.
-        masks: (B, 66, T) entries to hide.
-        steps: number of steps of the paper's gradient ascent.
-
-    Returns:
-        By method: (B, 66, T) tracks, and the truth in the same frame, metres of a standard body.
+    Returns, by method, (B, 66, T) tracks, and the truth in the same frame, metres of a standard body.
     """
     clean = [to_tracks(window, size) for window, size in zip(positions, sizes, strict=True)]
     truth = np.stack([t.x for t in clean])
@@ -136,12 +130,8 @@ def impute_whole_joints(model: HGVAE, positions: Floats, sizes: Floats, hidden: 
 
 
 def ascend_entries(model: HGVAE, start: Floats, observed: Mask, steps: int) -> Floats:
-    """Impute as in the paper: Adam on the missing entries maximises the score of section 7, keeping each window's best.
-
-    Args:
-        start: (B, 66, T) metres, the observed entries and an initial guess of the others.
-        observed: (B, 66, T) valid mask.
-        steps: number of Adam's steps.
+    """Impute as in the paper: Adam maximises the score of section 7 over the entries of ``start`` (B, 66, T) metres
+    that are not ``observed``, keeping each window's best.
     """
     x = standardise(model, start)
     seen = torch.from_numpy(observed)

@@ -145,14 +145,8 @@ def camera_settings() -> FitSettings:
 
 def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], contacts: NDArray[np.bool_],
            floor: float = 0.0) -> dict[str, Any]:  # fmt: skip
-    """Return the figures of Table 2 over clips.
-
-    Args:
-        answers: (C,) estimates.
-        truth: (T, C, 22, 3) metres.
-        hidden: (T, C, 22) which joints were hidden.
-        contacts: (T, C, 8) true labels of load.
-        floor: height of the floor, metres.
+    """Return the figures of Table 2 over C clips with these joints (T, C, 22, 3) metres ``hidden`` (T, C, 22), true
+    labels of load (T, C, 8), and this height of the floor, metres.
     """
     said = np.stack([answer.joints for answer in answers], axis=1)
     error = position_error(said, truth)

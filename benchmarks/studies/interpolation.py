@@ -160,13 +160,8 @@ def place_deviation(train: MotionSet, windows: int = 4000) -> Floats:
 
 
 def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) -> dict[str, Any]:
-    """Return the figures of an estimate in the gap; accelerations include the gap's ends.
-
-    Args:
-        truth: C clips of T frames.
-        rotations: (C, T, 22, 3, 3) local, estimated.
-        root: (C, T, 3) metres, estimated.
-        deviation: (22, 3) metres from `place_deviation`, by which L2P is normalised.
+    """Return the figures of an estimate in the gap, of local rotations (C, T, 22, 3, 3) and root (C, T, 3) metres;
+    accelerations include the gap's ends. L2P is normalised by ``deviation`` (22, 3) of `place_deviation`.
     """
     joints = place_joints(rotations, truth.offsets[:, None]) + root[:, :, None]
     gap = truth.gap

@@ -201,13 +201,7 @@ def angle(rotation: Floats) -> Floats:
 
 
 def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
-    """Return errors in degrees: the median and the 95th percentile.
-
-    Args:
-        found: (T, C, 17, 3, 3) estimated orientations.
-        truth: (T, C, 17, 3, 3) aligned.
-        positions: (T, C, 22, 3) metres, true.
-    """
+    """Return errors of orientations (T, C, 17, 3, 3), aligned, in degrees: the median and the 95th percentile."""
     error = found.swapaxes(-1, -2) @ truth
     off = angle(error)
     swing, twist = _swing_twist(error)

@@ -251,15 +251,9 @@ def _while(
 
 
 def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bool_]) -> Iterator[Label]:
-    """Yield a person's labels as far as a camera can observe them.
+    """Yield a person's labels as far as a camera can observe them, by whether most of the person is in its view (T,).
 
     A person enters when they come into view. What they do at that moment begins then.
-
-    Args:
-        labels: labels of all people.
-        person: the person.
-        t: (T,) seconds.
-        seen: (T,) whether most of the person is in the camera's view.
     """
     for first, after in runs(seen):
         begin, end = float(t[first]), float(t[after - 1])

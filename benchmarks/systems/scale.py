@@ -46,14 +46,8 @@ PERIOD_MS = FRAME_NS / 1e6
 def serve(
     frames: list[PoseRaw], clients: int, hgvae: bool, periods: int, track: Callable[..., Iterable[int]]
 ) -> dict[str, Any]:
-    """Measure the milliseconds per 30 Hz period that the prior and the trajectories of these clients take.
-
-    Args:
-        frames: what each client observes.
-        clients: number of clients.
-        hgvae: whether windows are scored and hidden joints imputed.
-        periods: number of periods to measure.
-        track: shows progress over a range.
+    """Measure the milliseconds per 30 Hz period, of ``periods``, that the prior and the trajectories of these clients
+    take; with ``hgvae``, windows are scored and hidden joints imputed.
     """
     switched = {stage: {"enabled": hgvae} for stage in ("score", "impute")}
     prior = StreamBatch(PriorSettings.from_dict({"max_bodies": clients} | switched), clients)

@@ -24,13 +24,9 @@ ENOUGH = 5
 def check_layout(
     messages: Sequence[PoseRaw], max_bodies: int, min_confidence: float, *, identified: bool
 ) -> Iterator[Problem]:
-    """Problems with the layout, sensor pose, confidences and ids in a window of messages.
-
-    Args:
-        messages: the window.
-        max_bodies: largest number of bodies that the prior tracks at once.
-        min_confidence: confidence below which the prior takes a joint as unobserved.
-        identified: whether the prior assigns ids itself and ignores the source's.
+    """Problems with the layout, sensor pose, confidences and ids in a window of messages, for a prior that tracks
+    ``max_bodies``, takes joints of less than ``min_confidence`` as unobserved and, if ``identified``, assigns ids
+    itself.
     """
     if len(messages) < ENOUGH:
         return

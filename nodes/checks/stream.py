@@ -81,13 +81,7 @@ NOBODY = 60
 
 
 class StreamCheck:
-    """Checks a stream of ``pose/raw`` for misuse.
-
-    Args:
-        max_bodies: bodies that the prior tracks at once.
-        identified: whether the prior assigns ids itself.
-        min_confidence: confidence below which the prior takes a joint as unobserved.
-    """
+    """Checks a stream of ``pose/raw`` for misuse; the arguments are those of `check_layout`."""
 
     def __init__(self, max_bodies: int, *, identified: bool = False, min_confidence: float = 0.0) -> None:
         self._max_bodies, self._identified, self._min_confidence = max_bodies, identified, min_confidence
@@ -109,12 +103,8 @@ class StreamCheck:
         self._heard_ns = at_ns
 
     def problems(self, now_ns: int, *, live: bool, anew: bool = True) -> list[Problem]:
-        """The stream's current problems.
-
-        Args:
-            now_ns: wall time, nanoseconds.
-            live: whether the stream should continue in real time; False for a replay.
-            anew: whether to examine the messages; otherwise the last result is returned.
+        """The stream's current problems at wall time ``now_ns``; if ``live``, it should go on in real time. The
+        messages are examined only if ``anew``; otherwise the last result is returned.
         """
         last = self._window.last
         if last is None or self._ended:

@@ -196,13 +196,7 @@ class BodyLimit:
         self._settling = False
 
     def note(self, present: int, spent_ns: int, dropped: int) -> None:
-        """Record a processed frame.
-
-        Args:
-            present: number of bodies processed in it.
-            spent_ns: compute time, nanoseconds.
-            dropped: number of frames dropped so far for being late.
-        """
+        """Record a frame of ``present`` bodies, of ``spent_ns`` compute time, after ``dropped`` late frames."""
         self._worked += 1
         self._spent_ns += spent_ns
         self._present = max(present, 1)

@@ -78,12 +78,8 @@ def read_motion(path: Path, body: int | None = None) -> BodyMotion:
 
 
 def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion:
-    """Resample a motion to a constant rate, with constant bone lengths.
-
-    Args:
-        stamps_s: (T,) seconds, increasing.
-        positions: (T, 22, 3) metres, world.
-        rotations: (T, 22, 4) xyzw, local.
+    """Resample a motion to a constant rate, with constant bone lengths, from stamps (T,) seconds, increasing, positions
+    (T, 22, 3) metres, world, and local rotations (T, 22, 4) xyzw.
     """
     fps = _rate(stamps_s)
     at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * fps + 0.01) + 1) / fps

@@ -178,16 +178,11 @@ def _pairs(pipeline: dai.Pipeline, **outputs: dai.Node.Output) -> dai.Node.Outpu
 
 
 class Host:
-    """The part of one camera's pipeline that runs on this machine and produces skeletons.
+    """The part of one camera's pipeline, not yet started, that runs on this machine and produces skeletons.
 
-    Args:
-        pipeline: pipeline of the outputs, not yet started.
-        detections: output of detections, as in `Skeletons.build`.
-        depth: output of depth images, as in `Skeletons.build`.
-        readings: output of the IMU, and the rotation (3, 3) from its frame to the camera's; None without an IMU.
-        source: the camera's name.
-        clock: clock of the stamps.
-        images: output of undistorted colour images, and where to store them for the viewer; None for none.
+    ``detections`` and ``depth`` are outputs as in `Skeletons.build`; ``readings``, if there is an IMU, its output and
+    the rotation (3, 3) from its frame to the camera's; ``images``, if they are stored for the viewer, the output of
+    undistorted colour images, and where to.
     """
 
     def __init__(

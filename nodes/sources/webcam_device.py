@@ -30,15 +30,10 @@ Landmarker = Callable[[NDArray[Any], int], Any]
 
 
 class Lens:
-    """Undistorts a webcam's images, with calibrated intrinsics, or intrinsics guessed from the field of view.
+    """Undistorts a webcam's images of ``size`` (width and height, pixels), with calibrated intrinsics, scaled to images
+    of that size, or intrinsics guessed from the horizontal field of view (radians).
 
-    Args:
-        size: width and height of the images, pixels.
-        field_of_view: horizontal field of view, radians; used without a calibration.
-        calibration: the camera's calibration; scaled to images of another size.
-
-    Raises:
-        LaunchError: the calibration is for another aspect ratio.
+    Raises LaunchError if the calibration is for another aspect ratio.
     """
 
     def __init__(self, size: tuple[int, int], field_of_view: float, calibration: CalibrationSettings) -> None:

@@ -52,15 +52,10 @@ REST_HEIGHT: Floats = np.array(
 
 
 def forward_kinematics(rotations: Floats, offsets: Floats, root: Floats) -> tuple[Floats, Floats]:
-    """Compute joint positions from local rotations and bones. `prior.fit.tensors` has a version with gradients.
+    """Compute joint positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's
+    rotation, from local rotations (..., 22, 3, 3), bones (..., 22, 3) and the root's position (..., 3) metres.
 
-    Args:
-        rotations: (..., 22, 3, 3) local rotation matrices.
-        offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
-        root: (..., 3) metres, position of the pelvis.
-
-    Returns:
-        positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
+    `prior.fit.tensors` has a version with gradients.
     """
     world = global_rotations(rotations)
     positions = np.empty(rotations.shape[:-1])

@@ -174,16 +174,10 @@ def get_skeleton(name: str) -> Skeleton:
 def to_canonical(
     skeleton: Skeleton, positions: NDArray[np.floating], confidence: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Map a sensor's joints to the canonical 22.
+    """Map a sensor's J joints (..., J, 3) metres, in any frame and NaN where missing, to the canonical 22.
 
-    Args:
-        skeleton: the sensor's skeleton with J joints.
-        positions: (..., J, 3) metres, any frame; NaN where missing.
-        confidence: (..., J) in 0..1; all ones if omitted.
-
-    Returns:
-        Positions (..., 22, 3), NaN where unobserved, and confidence (..., 22), the least of the sensor joints used, 0
-        where unobserved.
+    Returns positions (..., 22, 3), NaN where unobserved, and confidence (..., 22), the least of the sensor joints used,
+    0 where unobserved. ``confidence`` (..., J) is all ones if omitted.
     """
     weights = skeleton.to_canonical
     if confidence is None:

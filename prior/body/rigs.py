@@ -183,13 +183,8 @@ def skeleton(
     left: Mapping[str, str | Mixture],
     to_right: Callable[[str], str],
 ) -> Skeleton:
-    """Build a skeleton from its table.
-
-    Args:
-        name: name of the skeleton.
-        middle: canonical joints of the middle.
-        left: canonical joints of the left side, named without the side.
-        to_right: counterpart on the right of each joint of the file's left; other joints stay the same.
+    """Build a skeleton from its canonical joints of the ``middle`` and of the ``left`` side, named without the side.
+    ``to_right`` maps a joint of the file's left to the right; other joints stay the same.
     """
     table = {joint: _weights(source) for joint, source in middle.items()}
     for joint, source in left.items():

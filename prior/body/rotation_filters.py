@@ -137,11 +137,7 @@ def unknown_turns(bodies: int) -> Floats:
 def follow_short_bones(orientations: Floats, offsets: Floats, sigma: Floats, turns: Floats) -> None:
     """Turn short bones towards their usual directions for one frame, in place. Other bones do not change.
 
-    Args:
-        orientations: (B, 22, 3, 3) of all joints in one frame of reference, from `solve_rotations`.
-        offsets: (B, 22, 3) metres, the bones.
-        sigma: (B, 22) metres along an axis, standard deviations of the joints used for the solution.
-        turns: (B, 4, 4) from `unknown_turns`, updated.
+    ``turns`` (B, 4, 4) from `unknown_turns` is updated; the other arguments are those of `follow_twist`.
     """
     above = orientations[:, PARENT[_SHORT]]
     shown = to_rotation_vectors(above.swapaxes(-1, -2) @ orientations[:, _SHORT])

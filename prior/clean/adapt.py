@@ -73,14 +73,10 @@ def layout_of(raw: PoseRaw, counters: Counter[str]) -> Skeleton | None:
 def canonical_bodies(
     raw: PoseRaw, layout: Skeleton, sensor: SensorFrame, counters: Counter[str], *, numbered: bool
 ) -> dict[int, BodyJoints]:
-    """Convert a message's bodies to canonical joints in the world.
+    """Convert a message's bodies in ``layout`` to canonical joints in the world; ``counters`` count what is refused, by
+    cause.
 
-    Args:
-        raw: the message.
-        layout: the layout of its joints.
-        sensor: the sensor's frame.
-        counters: counts what is refused, by cause.
-        numbered: whether the result is keyed by index in the message (for a source without stable ids) instead of id.
+    The result is keyed by id or, if ``numbered`` (for a source without stable ids), by index in the message.
     """
     bodies: dict[int, BodyJoints] = {}
     for index, body in enumerate(raw.bodies):

@@ -47,12 +47,10 @@ class StampGate:
         self._held: list[tuple[PoseRaw, int]] = []
 
     def admit(self, raw: PoseRaw, at_ns: int = 0, *, gap: bool = False) -> list[tuple[PoseRaw, int]]:
-        """Return the messages to process now, oldest first; none while a jump is being judged.
+        """Return the messages to process now, with their times of arrival, oldest first; none while a jump is being
+        judged.
 
-        Args:
-            raw: the newest message.
-            at_ns: its time of arrival, returned with it.
-            gap: whether this node dropped messages before it, so that its stamp may be later than usual.
+        If this node dropped messages before it (``gap``), its stamp may be later than usual.
         """
         if raw.end_of_stream:
             return [*self.release(), (raw, at_ns)]

@@ -100,12 +100,8 @@ class PersonEstimator:
         )
 
     def update(self, smoothed: Smoothed | None, bias_sigma: Floats, present: Bools) -> Person:
-        """Sample the newest estimate of the bodies for which a sample is due, and renew the bones.
-
-        Args:
-            smoothed: joints and their standard deviations; None if there is no estimate yet.
-            bias_sigma: (S,) metres along an axis, the sensor's bias estimated so far.
-            present: (S,) which slots hold a body.
+        """Sample the newest estimate, if there is one, of the bodies ``present`` (S,) for which a sample is due, and
+        renew the bones. ``bias_sigma`` (S,) metres along an axis is the sensor's bias estimated so far.
         """
         if not self._settings.enabled or smoothed is None:
             return self.current
@@ -172,12 +168,8 @@ class BiasEstimator:
         self.bias_sigma = np.where(slot, self._expected, self.bias_sigma)
 
     def update(self, smoothed: Smoothed | None, person: Person, jitter: Floats) -> SensorBias:
-        """Update the estimate with a smoothed frame, if there is one.
-
-        Args:
-            smoothed: (S, 22) joints and their standard deviations.
-            person: the bones in use.
-            jitter: (S,) metres along an axis, the sensor's jitter.
+        """Update the estimate with a smoothed frame, if there is one, of bodies with these bones and this jitter (S,)
+        of the sensor, metres along an axis.
         """
         expected = np.minimum(self._expected, JITTER_RATIO * jitter)
         bias, variance = expected.copy(), np.full((len(expected), len(RIGID)), UNKNOWN_VARIANCE)

@@ -91,12 +91,10 @@ class Identify:
         self._lengths_s = np.zeros((rows, len(_BONES)))
 
     def update(self, stamp_ns: int, bodies: Floats, confidence: Floats) -> list[int | None]:
-        """Return the id of each body of a frame; None for a body without an id yet.
+        """Return the id of each body (N, 22, 3) metres, world-aligned, NaN where unobserved; None for a body without an
+        id yet.
 
-        Args:
-            stamp_ns: time of capture. An earlier stamp than the last, or a much later one, starts a new stream.
-            bodies: (N, 22, 3) metres, world-aligned; NaN where unobserved.
-            confidence: (N, 22).
+        An earlier stamp than the last, or a much later one, starts a new stream.
         """
         if self._origin_ns < 0 or not 0 < stamp_ns - self._last_ns <= self._settings.death * 1e9:
             self.reset()

@@ -29,12 +29,8 @@ SIGMA_SCALE = 1.2
 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:
-    """Complete the last ``frames`` frames of every body that has hidden joints in them; None if no body has.
-
-    Args:
-        windows: the newest windows; None if no body is present.
-        jitter: (S,) metres along an axis, estimated from each body.
-        frames: number of frames that are still to be published.
+    """Complete the last ``frames`` frames, still to be published, of every body that has hidden joints in them; None if
+    no body has. ``jitter`` (S,) metres along an axis is each body's.
     """
     if windows is None:
         return None
@@ -54,12 +50,8 @@ def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed 
 
 
 def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:
-    """Fill gaps with the reconstruction, continuous at their edges; returns (..., 66, T) metres.
-
-    Args:
-        tracks: observed windows (..., 66, T).
-        mean: (..., 66, T) metres, their reconstruction.
-        noise: (...) metres along an axis, jitter of the observed joints.
+    """Fill gaps of windows (..., 66, T) metres with their reconstruction ``mean``, continuous at their edges. ``noise``
+    (...) is the jitter of the observed joints, metres along an axis.
     """
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))

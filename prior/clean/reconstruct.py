@@ -61,13 +61,8 @@ class Reconstruct:
         self.frames = self._model.frames
 
     def update(self, history: History, present: Bools, person: Person, bias_sigma: Floats) -> BodyWindows | None:
-        """Reconstruct the windows of the bodies present; None if no body is present.
-
-        Args:
-            history: the observations.
-            present: (S,) which slots hold a body.
-            person: the bodies' bones.
-            bias_sigma: (S,) metres along an axis, the sensor's bias, estimated from each body.
+        """Reconstruct the windows of the bodies ``present`` (S,); None if there is none. ``bias_sigma`` (S,) metres
+        along an axis is estimated from each body.
         """
         slots = np.flatnonzero(present)
         if not len(slots):

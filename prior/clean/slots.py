@@ -43,12 +43,8 @@ class Slots(Generic[Key]):
         self._last_observed_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
 
     def crowded_out(self, most: int, bodies: Iterable[tuple[Key | None, BodyJoints]], sensor: Floats) -> Bools:
-        """Return the slots (S,) of the farthest bodies, those beyond the ``most`` for which there is time.
-
-        Args:
-            most: largest number of bodies from now on.
-            bodies: the bodies of the newest message, as in `arrange`.
-            sensor: (3,) metres, position of the sensor.
+        """Return the slots (S,) of those bodies, farthest from the sensor (3,), beyond the ``most`` for which there is
+        time from now on.
         """
         self._most = most
         out = np.zeros(len(self.keys), dtype=bool)

@@ -36,14 +36,10 @@ KNOWN_SIGMA = 0.02
 def draw(
     completed: Completed, sigma: Floats, offsets: Floats, covariance: Floats, random: np.random.Generator
 ) -> Completed:
-    """Draw an alternative.
+    """Draw an alternative to a completion of T frames, with deviations (T, 22) metres along an axis and bones (22, 3).
 
-    Args:
-        completed: a completion of T frames; frames without positions stay so.
-        sigma: (T, 22) metres along an axis, standard deviations of its joints.
-        offsets: (22, 3) metres, the person's bones.
-        covariance: (66, 66) of joints in the trunk's frame (`LivePosture.covariance`).
-        random: a source of random numbers.
+    ``covariance`` (66, 66) is of joints in the trunk's frame (`LivePosture.covariance`). Frames without positions stay
+    so.
     """
     rows = np.isfinite(completed.positions).all(axis=(1, 2))
     joints, known = completed.positions[rows], completed.known[rows]

@@ -299,12 +299,8 @@ def is_root_centred(positions: Floats) -> bool:
 
 
 def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """Predict root velocities (T, 3) m/s, world.
-
-    Args:
-        network: the network, run frame by frame.
-        joints: (T, 22, 3) metres relative to the root, z up.
-        root_rotations: (T, 3, 3) rotations of the root to the world.
+    """Predict root velocities (T, 3) m/s, world, frame by frame, of joints (T, 22, 3) metres relative to the root, z
+    up, whose rotations (T, 3, 3) are to the world.
     """
     yaw = heading(root_rotations)
     features = velocity_features(joints, np.concatenate([joints[:1], joints[:-1]]), FRAME_S, yaw)

@@ -45,13 +45,8 @@ class Trigger:
         self.confidence = 0.0
 
     def update(self, stamp_ns: int, value: float, sigma: float, possible: bool = True) -> bool:
-        """Process the next value; returns whether the condition has begun or ended.
-
-        Args:
-            stamp_ns: stamp of the value.
-            value: the value; if it is NaN, nothing begins or ends.
-            sigma: its standard deviation.
-            possible: whether the condition's other requirements hold.
+        """Process the next value and its standard deviation; returns whether the condition has begun or ended. Of NaN,
+        nothing begins or ends; nor does anything begin unless ``possible``.
         """
         self.confidence = probability_above(value, sigma, 0.5 * (self._on + self._off))
         doubt = self._sigmas * sigma

@@ -138,13 +138,10 @@ class HumorNet(nn.Module):
         return _gaussian(self.encoder(torch.cat([inputs, next_inputs], dim=-1)))
 
     def decode(self, state: State, inputs: Tensor, latent: Tensor, offsets: Tensor) -> tuple[State, Tensor]:
-        """Return the next states, in the canonical frames of these, and contact logits (..., 16): load, then rest.
+        """Return the next states, in the canonical frames of these (...), and contact logits (..., 16): load, then
+        rest.
 
-        Args:
-            state: (...) canonical.
-            inputs: (..., `FEATURES`) their features, standardised.
-            latent: (..., latent).
-            offsets: (..., 22, 3) metres, bones.
+        ``inputs`` (..., `FEATURES`) are the states' features, standardised; ``offsets`` (..., 22, 3) metres are bones.
         """
         output = self.decoder(inputs, latent)
         if self.config.residual:
@@ -214,13 +211,8 @@ class Rollout:
 
 
 def roll_out(model: HumorNet, initial: State, latents: Tensor, offsets: Tensor) -> Rollout:
-    """Compute x_T = f(x_0, z_1..T), section 3.
-
-    Args:
-        model: trained model.
-        initial: (...) states.
-        latents: (..., T, latent).
-        offsets: (..., 22, 3) metres, bones.
+    """Compute x_T = f(x_0, z_1..T), section 3, from states (...), latents (..., T, latent) and bones (..., 22, 3)
+    metres.
     """
     return _rolled(model, initial, offsets, list(latents.unbind(dim=-2)))
 

@@ -63,12 +63,8 @@ def choose(mask: Tensor, yes: State, no: State) -> State:
 
 
 def states_of(root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
-    """Return the states (..., T - 1) of a motion from its second frame on; the first has no velocity.
-
-    Args:
-        root: (..., T, 3) metres.
-        rotations: (..., T, 22, 3, 3) local.
-        offsets: (..., 22, 3) metres, the person's bones, equal in all frames.
+    """Return the states (..., T - 1) of a motion from its second frame on; the first has no velocity. ``root`` (..., T,
+    3) metres and local rotations (..., T, 22, 3, 3) are of one person's bones (..., 22, 3).
     """
     joints = forward_kinematics(rotations, offsets.unsqueeze(-3), root)[0]
     velocity = joints.diff(dim=-3) * FPS
@@ -141,12 +137,8 @@ def pose_features(inputs: Tensor) -> Tensor:
 
 
 def moved_by(state: State, change: Tensor, offsets: Tensor) -> State:
-    """Advance canonical states by one step: HuMoR's Euler step, with rotations multiplied from the left.
-
-    Args:
-        state: (...) canonical.
-        change: (..., `CHANGE`) metres and radians.
-        offsets: (..., 22, 3) metres, bones.
+    """Advance canonical states (...) by a change (..., `CHANGE`) in metres and radians: HuMoR's Euler step, with
+    rotations multiplied from the left. Bones are (..., 22, 3) metres.
     """
     turns = change[..., 3:].unflatten(-1, (JOINT_COUNT, 3))
     return posed(state, state.root + change[..., :3], small_exp(turns) @ state.rotations, offsets)

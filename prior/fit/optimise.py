@@ -71,12 +71,8 @@ class _Known:
 
 
 class Optimiser:
-    """Completes windows like `PartsCompleter`, by optimisation from its output.
-
-    Args:
-        model: the model to optimise through.
-        completer: gives the initial motion, and the root.
-        seed: random seed of initial latents, as in the paper; None for the latents of the completer's output.
+    """Completes windows like `PartsCompleter`, by optimisation through ``model`` from the output of ``completer``,
+    which also gives the root. ``seed`` draws initial latents, as in the paper; None takes those of that output.
     """
 
     def __init__(self, model: HMVAE, completer: PartsCompleter, seed: int | None = None) -> None:

@@ -119,12 +119,8 @@ class SmplMotion:
 
 
 def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion:
-    """Fit a model's motion to joints.
-
-    Args:
-        shape: shape of the model.
-        joints: (T, 22, 3) metres, z up, complete.
-        lengths: (22,) metres, bone lengths.
+    """Fit the motion of a model of this shape to joints (T, 22, 3) metres, z up, complete, with these bone lengths
+    (22,).
     """
     betas = shape.of_lengths(lengths)
     rest = shape.joints(betas)

@@ -216,17 +216,10 @@ def _accelerations(start: Start) -> Tensor:
 def minimise(
     model: HumorNet, variables: Variables, names: Sequence[str], terms: Sequence[Term], steps: int
 ) -> tuple[Variables, float]:
-    """Minimise the energy by L-BFGS.
+    """Minimise the energy of the terms by L-BFGS in at most ``steps``, over the variables of these names; the others
+    are fixed.
 
-    Args:
-        model: the transition model.
-        variables: initial variables.
-        names: names of the free variables; the others are fixed.
-        terms: terms of the energy.
-        steps: largest number of steps.
-
-    Returns:
-        The variables of least energy, and that energy, nats.
+    Returns the variables of least energy, and that energy, nats.
     """
     initial = [getattr(variables, name) for name in names]
     conditioned = preconditioner(len(variables.root)).to(variables.root.dtype)

@@ -16,15 +16,9 @@ from steadypose.prior.models.weights import load_weights
 
 
 def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Compute joint positions from local rotations and a person's bones.
-
-    Args:
-        rotations: (..., 22, 3, 3) local rotation matrices.
-        offsets: (..., 22, 3) metres, each joint in its parent's frame; broadcasts over leading dimensions.
-        root: (..., 3) metres, position of the pelvis; the origin if omitted.
-
-    Returns:
-        Positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's rotation.
+    """Compute joint positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's
+    rotation, from local rotations (..., 22, 3, 3), bones (..., 22, 3) and the root's position (..., 3), the origin if
+    omitted.
     """
     batch = rotations.shape[:-3]
     offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
@@ -89,17 +83,11 @@ def load_tensors(name: str, model: str) -> tuple[dict[str, Tensor], dict[str, An
 def load_network(
     network: Callable[[Config], N], config: Callable[[dict[str, Any]], Config], name: str, model: str
 ) -> N:
-    """Load a trained network, in evaluation mode.
+    """Load a trained network, in evaluation mode: ``network`` is its class, ``config`` makes the class's configuration
+    of a weights file's JSON, such as `HGVAEConfig.from_dict`, and ``name`` and ``model`` are as in `load_weights`.
 
-    Args:
-        network: its class, such as `HGVAE`.
-        config: function from a weights file's JSON to the class's configuration, such as `HGVAEConfig.from_dict`.
-        name: the weight set, such as ``default``, or a path to a ``.safetensors`` file.
-        model: the model's name, such as ``hgvae``.
-
-    Raises:
-        FileNotFoundError: there are no such weights; the message lists those that exist.
-        WeightsError: the file belongs to another model.
+    Raises FileNotFoundError if there are no such weights (the message lists those that exist), WeightsError if the file
+    belongs to another model.
     """
     state, stored = load_tensors(name, model)
     loaded = network(config(stored))

@@ -85,15 +85,8 @@ def fit_track(
     stages: int = 3,
     advanced: Callable[[], None] = lambda: None,
 ) -> FittedTrack:
-    """Fit all windows of a track.
-
-    Args:
-        model: the transition model.
-        track: starts and observations.
-        settings: settings of each window's fit.
-        folder: cache of fitted windows, keyed by a digest of everything that a fit depends on.
-        stages: as in `fit_window`.
-        advanced: called after each window.
+    """Fit all windows of a track, as `fit_window`. ``folder`` is a cache of fitted windows, keyed by a digest of
+    everything that a fit depends on; ``advanced`` is called after each window.
     """
     done: list[dict[str, Floats]] = []
     starts = track.starts

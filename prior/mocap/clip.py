@@ -92,15 +92,11 @@ def person_of(source: str, subject: str) -> str:
 def forward(
     parents: Sequence[int], offsets: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute positions of any skeleton from its local rotations.
+    """Compute positions (T, J, 3) in the unit of ``offsets`` and global rotations (T, J, 3, 3) of any skeleton from its
+    local rotations (T, J, 3, 3).
 
-    Args:
-        parents: parents of J joints, each before its children; -1 for a root.
-        offsets: (J, 3) or, if bones vary, (T, J, 3), each joint in its parent's frame; a root's offset is its position.
-        local: (T, J, 3, 3) rotations.
-
-    Returns:
-        Positions (T, J, 3) in the unit of ``offsets``, and global rotations (T, J, 3, 3).
+    ``parents`` come before their children, -1 for a root. ``offsets`` are (J, 3) or, if bones vary, (T, J, 3), each
+    joint in its parent's frame; a root's is its position.
     """
     offsets = np.broadcast_to(offsets, local.shape[:-1])
     positions, rotations = np.empty(local.shape[:-1]), np.empty(local.shape)

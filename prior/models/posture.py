@@ -92,12 +92,8 @@ class LivePosture:
         return cls(load_weights(weights, "posture")[0], spread)
 
     def __call__(self, positions: Floats, sigma: Floats, lengths: Floats) -> Expected:
-        """Estimate joints from noisy ones.
-
-        Args:
-            positions: (B, 22, 3) metres, observed joints.
-            sigma: (B, 22) metres, their standard deviations along an axis.
-            lengths: (B, 22) metres, length of each joint's bone, 0 for the root.
+        """Estimate joints (B, 22, 3) metres from noisy ones, their standard deviations (B, 22) along an axis, and the
+        lengths (B, 22) of each joint's bone, 0 for the root.
         """
         frame, middle = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1)
         size = lengths.sum(axis=-1) / _REST_SIZE
@@ -124,13 +120,8 @@ class LivePosture:
 
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
-    """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances.
-
-    Args:
-        expected: the posture's estimate of these bodies.
-        positions: (B, 22, 3) metres, observed joints.
-        sigma: (B, 22) metres, their standard deviations along an axis.
-        offsets: (B, 22, 3) metres, the bones.
+    """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances:
+    observed joints (B, 22, 3) metres, deviations (B, 22) along an axis and bones (B, 22, 3).
     """
     known, rigid = expected.root_covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
     off = to_rotation_vectors(expected.root.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
@@ -139,18 +130,14 @@ def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: 
 
 
 class RootCovariance:
-    """Computes the covariance of a root's orientation, which messages do not carry, from published joints and deviations."""
+    """The covariance of a root's orientation, which messages do not carry, of published joints and deviations."""
 
     def __init__(self, weights: str = "default") -> None:
         self._posture = LivePosture.load(weights)
 
     def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
-        """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame.
-
-        Args:
-            positions: (B, 22, 3) metres.
-            sigma: (B, 22) metres, standard deviations along an axis.
-            root: (B, 3, 3) orientations of the pelvis.
+        """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame, of joints (B, 22,
+        3) metres, deviations (B, 22) along an axis and orientations of the pelvis (B, 3, 3).
         """
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0

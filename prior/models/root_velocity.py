@@ -60,13 +60,10 @@ class NewestMotion(NamedTuple):
 
 
 def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> NDArray[np.float32]:
-    """Build the features (B, `FEATURES`) of B frames, turned so that each body faces +x.
+    """Build the features (B, `FEATURES`) of B frames, turned by their heading (B,) so that each body faces +x.
 
-    Args:
-        joints: (B, 22, 3) metres relative to the root, z up.
-        before: (B, 22, 3) metres, joints in the frame before.
-        dt: (B,) or a number, seconds between the two frames.
-        yaw: (B,) radians, heading of the body.
+    ``joints`` and ``before``, those in the frame ``dt`` seconds before, are (B, 22, 3) metres relative to the root, z
+    up.
     """
     turn, step = yaw_matrix(yaw), np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(joints),))[:, None, None]
     velocity = np.clip((joints - before) / step @ turn, -FASTEST, FASTEST) / SPEED

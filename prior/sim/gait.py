@@ -63,17 +63,8 @@ def track(times: Floats, initial: ArrayLike, keys: Sequence[Key]) -> Floats:
 
 
 def drift(rng: np.random.Generator, times: Floats, std: ArrayLike, slowest_s: float, fastest_s: float) -> Floats:
-    """Random smooth motion: six sinusoids per channel with random periods and phases.
-
-    Args:
-        rng: random generator of the periods and phases.
-        times: (T,) seconds.
-        std: (C,) long-term standard deviation of each channel.
-        slowest_s: longest period in seconds.
-        fastest_s: shortest period in seconds.
-
-    Returns:
-        (T, C).
+    """Random smooth motion (T, C) of these long-term standard deviations (C,): six sinusoids per channel with random
+    periods, between these two in seconds, and phases.
     """
     std = np.atleast_1d(np.asarray(std, dtype=np.float64))
     waves = 6
@@ -227,12 +218,8 @@ class FootTrack:
 
 
 def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
-    """Compute the steps of one foot that a plan needs.
-
-    Args:
-        plan: the pelvis over the floor.
-        side: "left" or "right".
-        offsets: (22, 3) metres, the person's bones.
+    """Compute the steps of the foot on one side, "left" or "right", that a plan needs, of a person with bones (22, 3)
+    metres.
     """
     sign = 1.0 if side == "left" else -1.0
     sole = offsets[J[f"{side}_foot"]]

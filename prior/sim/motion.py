@@ -112,15 +112,10 @@ class Intent:
 
 
 def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion:
-    """Perform an intent with a given body.
+    """Perform an intent with a body of bones (22, 3) metres; ``rng`` draws the idle drift.
 
     The pelvis sways, tilts and turns with the steps, as high as the legs allow. The chest turns against it, and the
     arms swing from the shoulders. A body that stands still drifts slightly. Feet follow `foot_track`.
-
-    Args:
-        intent: the intent.
-        offsets: (22, 3) metres, the person's bones.
-        rng: random generator of the idle drift.
     """
     plan = intent.plan
     n = len(plan.times)

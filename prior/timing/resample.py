@@ -96,15 +96,8 @@ class Resampler:
         self._decimation.clear(slot)
 
     def update(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
-        """Process a frame and return the grid frames that it completes. A republished frame is ignored.
-
-        Args:
-            stamp_ns: capture time, later than the last.
-            positions: (S, 22, 3) metres, NaN where unobserved.
-            confidence: (S, 22).
-
-        Returns:
-            Frames at the grid times reached, oldest first.
+        """Process a frame (S, 22, 3) metres, NaN where unobserved, captured later than the last, and return the grid
+        frames that it completes, oldest first. A republished frame is ignored.
         """
         if self._tick_ns is None:
             first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up

@@ -93,13 +93,8 @@ class StillFeet:
         self._offset, self._before = np.zeros((4, 3)), np.full((4, 3), np.nan)
 
     def update(self, estimates: Floats, sigma: Floats, rest: Floats, dt: float) -> Floats:
-        """Return the published position of each foot, (4, 3) metres; NaN where there is no estimate.
-
-        Args:
-            estimates: (4, 3) metres, world; NaN where there is no estimate.
-            sigma: (4,) metres, their standard deviations.
-            rest: (4,) probabilities that the feet rest.
-            dt: seconds since the last call.
+        """Return the published position of each foot from estimates (4, 3) metres, world, NaN where there is none,
+        their deviations (4,), the probabilities (4,) that they rest, and the seconds since the last call.
         """
         moved = np.nan_to_num(estimates - self._before)
         offset = (self._offset - rest[:, None] * moved) * np.exp(-dt / EASE_S * (1.0 - rest))[:, None]
@@ -149,13 +144,9 @@ class Soles:
         return heights + moved, left, stands
 
     def learn(self, above: Floats, sigma: Floats, stands: Floats, dt: float) -> None:
-        """Update the standing heights from the observed heights of feet.
-
-        Args:
-            above: (4,) metres above the floor; NaN where foot or floor is unknown.
-            sigma: (4,) metres, standard deviations of the sensor's errors.
-            stands: (4,) probabilities that the feet stand.
-            dt: seconds since the last frame, above 0.
+        """Update the standing heights from observed heights (4,) above the floor, metres, NaN where foot or floor is
+        unknown, their deviations (4,), the probabilities (4,) that feet stand, and seconds since the last frame, above
+        0.
         """
         _learn(self._heights, self._variances, above, sigma, stands, max(MEMORY_S / dt, 1.0))
 

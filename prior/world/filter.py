@@ -89,13 +89,8 @@ class RootFilter:
     def update(
         self, observed: BodyObservation, velocity: RootVelocity | None, stance: Stance, floor: Floor
     ) -> RootState:
-        """Predict to the newest observation, and update with it.
-
-        Args:
-            observed: the newest observation.
-            velocity: the predicted root velocity; None if it is not used.
-            stance: feet that may anchor the root.
-            floor: gives the height of standing feet while the root is unobserved.
+        """Predict to the newest observation, and update with it, with the predicted root velocity if it is used, and
+        with the feet that may anchor the root; ``floor`` gives their height while the root is unobserved.
         """
         if observed.after_gap:
             for foot in range(len(FEET)):

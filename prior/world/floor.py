@@ -161,12 +161,8 @@ class Floor:
             self._height, self._variance = lowest, GUESS_SIGMA**2
 
     def observe(self, sole: Floats, sigma: float, dt: float) -> None:
-        """Update with the height of the ground under one standing foot.
-
-        Args:
-            sole: (3,) metres, world, the point of the sole under the joint.
-            sigma: metres, standard deviation of the height.
-            dt: seconds for which this foot has stood since the last update.
+        """Update with the point (3,) metres, world, of one standing foot's sole, the deviation of its height, and the
+        seconds for which it has stood since the last update.
         """
         height = float(sole[2])
         if not self.known:

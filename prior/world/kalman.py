@@ -159,22 +159,14 @@ class BodyFilter:
         _predict(self._x, self._p, dt, noise.density(speed), rates * dt, kept, noise.walk(load, rest, speed) * dt)
 
     def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
-        """Update with an observed root position.
-
-        Args:
-            position: (3,) metres, with both errors of the sensor.
-            jitter: metres, standard deviation of the error from frame to frame.
-            bias: metres, standard deviation of the slow bias.
+        """Update with an observed root position (3,) metres and the deviations of its errors: from frame to frame, and
+        slow.
         """
         self._correct({_POSITION: 1.0, _SENSOR: bias}, position, jitter)
 
     def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
-        """Update with the network's root velocity.
-
-        Args:
-            velocity: (3,) m/s, with both errors of the network.
-            jitter: (3,) or a number, m/s, standard deviation of the error from frame to frame.
-            bias: (3,) or a number, m/s, standard deviation of the slow bias.
+        """Update with the network's root velocity (3,) m/s and the deviations, (3,) or a number, of its errors: from
+        frame to frame, and slow.
         """
         self._correct({_VELOCITY: 1.0, _NETWORK: bias}, velocity, jitter)
 

@@ -111,14 +111,8 @@ def observe(
     bodies: Sequence[CleanBody], stamp_ns: int, orientation: Floats, position: Floats,
     last: Mapping[int, BodyObservation],
 ) -> list[BodyObservation]:  # fmt: skip
-    """Convert the bodies of a message to observations in the world.
-
-    Args:
-        bodies: the bodies; each id occurs once.
-        stamp_ns: stamp of the message.
-        orientation: (4,) unit quaternion xyzw, orientation of the sensor in the world.
-        position: (3,) metres, position of the sensor in the world.
-        last: last observation of each body, by id.
+    """Convert the bodies of a message, each id once, to observations in the world, in which the sensor has this
+    orientation (4,) xyzw and position (3,) metres. ``last`` is each body's last observation, by id.
     """
     if not bodies:
         return []

@@ -39,13 +39,11 @@ def draw_bias_sigma(count: int, rng: Rng) -> Floats:
 
 
 def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
-    """Add jitter of up to 10 cm, with a different deviation for each joint, and a slow bias to windows.
+    """Add jitter of up to 10 cm, with a different deviation for each joint, and a slow bias to windows (B, T, 22, 3)
+    metres.
 
-    Args:
-        positions: (B, T, 22, 3) metres.
-        rng: random generator.
-        bias_sigma: (B,) metres along an axis, standard deviations of the bias, such as from `draw_bias_sigma`; half of
-            the windows in which it is 0 get no jitter either.
+    ``bias_sigma`` (B,) metres along an axis may be of `draw_bias_sigma`; half of the windows in which it is 0 get no
+    jitter either.
     """
     count, frames, joints, _ = positions.shape
     jitter = 10 ** rng.uniform(-3.3, -1.0, (count, 1, 1, 1)) * np.exp(0.4 * rng.standard_normal((count, 1, joints, 1)))
@@ -93,13 +91,11 @@ def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Flo
 
 
 def with_drifting_error(positions: Floats, sigma: Floats, rng: Rng, jitter_share: Floats) -> Floats:
-    """Add jitter and a drifting bias (an AR(1) process) to windows; in half of them, some joints have larger errors.
+    """Add jitter and a drifting bias (an AR(1) process) to windows (B, T, 22, 3) metres; in half, some joints are
+    worse.
 
-    Args:
-        positions: (B, T, 22, 3) metres.
-        sigma: (B,) metres along an axis, RMS error over all joints.
-        rng: random generator.
-        jitter_share: (B,) share of jitter in the error's variance.
+    ``sigma`` (B,) is the RMS error over all joints, metres along an axis; ``jitter_share`` (B,) that of jitter in its
+    square.
     """
     count, frames, joints, _ = positions.shape
     factor = np.exp(rng.choice([0.0, 0.5], (count, 1)) * rng.standard_normal((count, joints)))

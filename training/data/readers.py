@@ -151,10 +151,7 @@ def stem_of(name: str) -> str:
 def read_own(path: Path, progress: Progress, description: Description = UNDESCRIBED) -> Iterator[Clip | Dropped]:
     """Read the motion files of a user's folder, archive or file. Each file's folder names its person.
 
-    Args:
-        path: folder, archive or file.
-        progress: called with the share that is read.
-        description: properties that the files lack.
+    ``progress`` is called with the share that is read; ``description`` has what the files lack.
     """
     for name, content in members(path, SUFFIXES, progress):
         try:

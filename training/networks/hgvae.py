@@ -115,12 +115,9 @@ class HGVAE(nn.Module):
 
     @torch.no_grad()
     def completed(self, x: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
-        """Complete unobserved entries; returns windows (B, N, T) and the certainty (B, N, T) of each entry.
-
-        Args:
-            x: (B, N, T) tracks; unobserved entries hold the interpolation of `features.to_tracks`.
-            observed: (B, N, T) 1 where observed, else 0.
-            bias_sigma: (B,) metres along an axis, the sensor's bias.
+        """Complete unobserved entries of tracks (B, N, T), which hold the interpolation of `features.to_tracks`;
+        returns windows (B, N, T) and the certainty (B, N, T) of each entry. ``bias_sigma`` (B,) is the sensor's bias,
+        metres along an axis.
         """
         if self.completion is None:
             return x, observed

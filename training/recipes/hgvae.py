@@ -50,15 +50,11 @@ radians. There are only 22 people to train on."""
 
 
 def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[CompletionNet]:
-    """Return the recipe of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries.
+    """Return the recipe of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries; the
+    model's ``mean`` is set.
 
     Each entry is weighted by its predicted standard deviation (Seitzer et al., "On the Pitfalls of Heteroscedastic
     Uncertainty Estimation", ICLR 2022, beta = 0.5). Otherwise, entries of small deviation would dominate the gradient.
-
-    Args:
-        model: an HG-VAE with a completion network; its ``mean`` is set.
-        train: training motion.
-        val: motion of other people, for the validation curves.
     """
     network = _network(model)
 

@@ -83,12 +83,8 @@ REPEATED = 0.15
 
 
 def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
-    """Train the fault network of an HG-VAE, calibrate it on validation motion, and write both beside HG-VAE's weights.
-
-    Args:
-        path: path of HG-VAE's weights, ``.safetensors``.
-        iterations: number of optimiser steps.
-        options: HG-VAE's training options, except that ``start`` names weights of a fault network.
+    """Train the fault network of the HG-VAE at ``path``, calibrate it on validation motion, and write both beside it.
+    ``options`` are HG-VAE's, except that ``start`` names weights of a fault network.
     """
     weights, seed = options.weights, options.seed
     model = load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")

@@ -134,13 +134,9 @@ def _augment(rotations: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = None) -> Tensor:
-    """Return windows (B, T, 22, 3, 3) solved from noisy joints with bones (B, 22, 3).
+    """Return windows (B, T, 22, 3, 3) solved from noisy joints with bones (B, 22, 3) metres.
 
-    Args:
-        rotations: true rotations.
-        offsets: bones, metres.
-        rng: random generator.
-        noise: metres along an axis, independent noise of all joints in each frame; random if omitted.
+    ``noise`` is the independent noise of all joints in each frame, metres along an axis; random if omitted.
     """
     joints = forward_kinematics(rotations, offsets[:, None])[0].double().numpy()
     count, frames = joints.shape[:2]

@@ -158,12 +158,8 @@ def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
 
 
 def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
-    """Fit the model's mixture of initial states (HuMoR, section 3) by expectation-maximisation.
-
-    Args:
-        model: the model whose buffers are filled.
-        inputs: (N, `FEATURES`) standardised features of states in their canonical frames.
-        seed: random seed of the initial responsibilities.
+    """Fit the model's mixture of initial states (HuMoR, section 3) by expectation-maximisation, to standardised
+    features (N, `FEATURES`) of states in their canonical frames.
     """
     from sklearn.mixture import GaussianMixture  # in the extra `train`, and slow to import
 
@@ -178,14 +174,8 @@ def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
 def transition_loss(model: HumorNet, batch: Batch, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
     """Compute equation 7: reconstruction, KL divergence and regularisers, with scheduled sampling of the states.
 
-    Args:
-        model: the model, in training mode.
-        batch: sequences.
-        done: progress of the training, 0 to 1.
-        rng: random generator that selects the steps that start from the true state.
-
-    Returns:
-        The loss, and its terms by name.
+    ``done`` is the progress of the training, 0 to 1; ``rng`` selects the steps that start from the true state. Returns
+    the loss, and its terms by name.
     """
     own = float(np.clip((done - TRUE_UNTIL) / (OWN_FROM - TRUE_UNTIL), 0.0, 1.0))
     true = batch.states[:, :-1]

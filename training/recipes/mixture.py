@@ -118,13 +118,10 @@ class Errors(NamedTuple):
 
 
 def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Errors:
-    """Weighted mean errors of each clip.
+    """Weighted mean errors of each clip's joints (C, T, 22, 3) metres; ``weight`` and ``counts`` are (C, T, 22).
 
-    Args:
-        places: (C, T, 22, 3) metres, estimates; may be NaN where the weight is 0.
-        truth: (C, T, 22, 3) metres.
-        weight: (C, T, 22) weight of all errors.
-        counts: (C, T, 22) additional weight of position errors; acceleration errors are divided by its square root.
+    Estimates may be NaN where the weight is 0. ``counts`` weight positions; acceleration errors are divided by their
+    square root.
     """
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]

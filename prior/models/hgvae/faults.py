@@ -86,13 +86,7 @@ def fault_features(
 
 
 class LiveFaultNet:
-    """A trained `FaultNet`.
-
-    Args:
-        config: its sizes.
-        weights: its state dict.
-        max_batch: largest number of windows per call.
-    """
+    """A trained `FaultNet` for at most ``max_batch`` windows per call."""
 
     def __init__(self, config: FaultNetConfig, weights: Arrays, max_batch: int) -> None:
         p = Program()
@@ -148,12 +142,8 @@ class Calibration:
         path.write_text(json.dumps({"note": note, "quantiles": np.round(self.quantiles, 4).tolist()}) + "\n")
 
     def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats, paces: Floats) -> Floats:
-        """Return the scores (B, R) of clean windows at `RATES`, interpolated between the measured conditions.
-
-        Args:
-            missing: (B,) numbers of missing joints.
-            sensor_sigma: (B,) metres along an axis, error of the sensor.
-            paces: (B,) m/s, `pace`.
+        """Return the scores (B, R) of clean windows at `RATES`, interpolated between the measured conditions: numbers
+        of missing joints (B,), errors of the sensor (B,) metres along an axis, and `pace`s (B,) m/s.
         """
         by_missing = _interpolation_weights(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
         by_sensor = _interpolation_weights(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
@@ -175,12 +165,8 @@ def pace(mean: Floats) -> Floats:
 
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
-    """Adjust the fault network's log odds (B, 22) for frozen joints; -inf for joints unobserved in the scored frames.
-
-    Args:
-        odds: (B, 22) log odds of `FaultNet`.
-        observed: (B, 66, T) more than 0 where observed.
-        frozen: (B, 22) joints whose last position the sensor repeats.
+    """Adjust the fault network's log odds (B, 22) for frozen joints (B, 22), whose last position the sensor repeats;
+    -inf for joints that are not observed (B, 66, T) in the scored frames.
     """
     seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
     return np.where(seen, np.where(frozen, np.maximum(odds, FROZEN_ODDS), odds), -np.inf)

@@ -24,15 +24,8 @@ class Reconstruction(NamedTuple):
 
 
 class LiveHGVAE:
-    """A trained `HGVAE` at the means of its latents.
-
-    Args:
-        config: its sizes; without actions.
-        weights: its state dict, which is copied.
-        max_batch: largest number of windows per call.
-
-    Attributes:
-        frames: T, frames of a window.
+    """A trained `HGVAE`, without actions, at the means of its latents, for windows of ``frames`` (T) and at most
+    ``max_batch`` windows per call.
     """
 
     def __init__(self, config: HGVAEConfig, weights: Arrays, max_batch: int) -> None:
@@ -80,12 +73,8 @@ class LiveHGVAE:
     def reconstruct(
         self, x: NDArray[np.float64], observed: NDArray[np.float64], bias_sigma: NDArray[np.float64]
     ) -> Reconstruction:
-        """Encode and decode windows.
-
-        Args:
-            x: (B, 66, T) metres of a body of standard size, `Tracks.x`; NaN for a joint never observed.
-            observed: (B, 66, T) more than 0 where observed.
-            bias_sigma: (B,) metres along an axis, the sensor's bias.
+        """Encode and decode windows `Tracks.x` (B, 66, T) metres of a body of standard size, NaN for a joint never
+        observed; ``bias_sigma`` (B,) is the sensor's bias, metres along an axis.
         """
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE

@@ -219,13 +219,7 @@ def _measure_noise(deviations, seen, nodes, noise):
 
 
 class LiveCompletion:
-    """A trained `CompletionNet`.
-
-    Args:
-        config: its sizes.
-        weights: its state dict.
-        max_batch: largest number of windows per call.
-    """
+    """A trained `CompletionNet` for at most ``max_batch`` windows per call."""
 
     def __init__(self, config: CompletionConfig, weights: Arrays, max_batch: int) -> None:
         p, self._patch = Program(), config.patch

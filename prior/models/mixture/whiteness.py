@@ -124,11 +124,7 @@ def _update(positions, last, step, frames, mean, variance, change, pairs, undone
 
 
 def fallback(white: NDArray[np.float64], scale: NDArray[np.float64], delay: int) -> NDArray[np.float64]:
-    """Return the weight (S,) of the multiple-model estimate.
-
-    Args:
-        white: (S,) share of the noise that is white.
-        scale: (S,) metres along an axis, estimated noise.
-        delay: look-ahead of the smoother, frames.
+    """Return the weight (S,) of the multiple-model estimate, by the share of the noise that is white (S,), the
+    estimated noise (S,) metres along an axis, and the smoother's look-ahead in frames.
     """
     return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / (LARGE if delay else LARGE_NEWEST))))
