@@ -118,15 +118,15 @@ class Filter:
             stamp_ns: time of capture in whole nanoseconds, instead of ``t``.
             confidence: (J,) or (B, J) 0 to 1, or True where a joint was seen, if the source has it.
             ids: list of the ids of the B bodies, one per person, integers of 32 bits. Default: 0, 1, ….
-            sensor_pose: pose of the sensor in this frame, if the camera moves.
+            sensor_pose: pose of the sensor in this frame, if the camera moves; then in every frame until `flush`.
 
         Returns:
             The pose of one body, or poses with an axis of bodies if ``joints`` has one. None for the first ``delay``
             frames, while nobody is visible, and in some calls if the camera is faster than 30 Hz.
 
         Raises:
-            FilterError: an array or the ids have the wrong form, or there is not one time of capture; the frame is not
-                used.
+            FilterError: an array or the ids have the wrong form, or there is not one time of capture, or no sensor
+                pose although the frame before had one; the frame is not used.
         """
         found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
         return found[-1] if found else None
@@ -146,9 +146,13 @@ class Filter:
         _check_pose(sensor_pose)
         stamp = _stamp(t, stamp_ns)
         bodies, self._several = self._bodies(joints, confidence, ids)
-        if sensor_pose is not None:
-            self._pose, self._calibrated = sensor_pose, True
-        raw = PoseRaw(stamp, "sensor", "program", self._skeleton, self._pose, self._calibrated, bodies)
+        if sensor_pose is None and self._last is not None and self._last.sensor_pose is not self._pose:
+            raise FilterError(
+                "sensor_pose: expected one with every frame, as with the last, got none; if the camera stands still, "
+                "give it to Filter alone"
+            )
+        pose, calibrated = sensor_pose or self._pose, self._calibrated or sensor_pose is not None
+        raw = PoseRaw(stamp, "sensor", "program", self._skeleton, pose, calibrated, bodies)
         self._diagnosis.see(raw)
         self._last = raw
         poses = self._poses(self._prior.process(raw))

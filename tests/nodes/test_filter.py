@@ -170,6 +170,22 @@ def test_a_camera_that_moves_says_where_it_is(joints: np.ndarray) -> None:
     np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
 
 
+def test_a_camera_that_moves_says_so_with_every_frame(joints: np.ndarray) -> None:
+    """One that came once would go on to count, although the camera is elsewhere by then."""
+    place = steadypose.Pose(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]))
+    cleaner = steadypose.Filter(delay=0)
+    cleaner(joints[0, 0], 0.0, sensor_pose=place)
+    with pytest.raises(ValueError, match="expected one with every frame"):
+        cleaner(joints[1, 0], 1 / 30)
+    pose = cleaner(joints[1, 0], 1 / 30, sensor_pose=place)
+    assert pose is not None
+    np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
+    cleaner.flush()
+    pose = cleaner(joints[2, 0], 1.0)
+    assert pose is not None
+    np.testing.assert_allclose(pose.world["head"], pose.positions["head"], atol=0.15)
+
+
 def test_the_library_is_above_all_commands() -> None:
     """What both need lies below both: no module outside the library imports it."""
     own = re.compile(r"^\s*(from|import) steadypose\.nodes\.library", re.MULTILINE)
