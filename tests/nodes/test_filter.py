@@ -181,7 +181,7 @@ def test_a_camera_that_moves_says_so_with_every_frame(joints: np.ndarray) -> Non
     assert pose is not None
     np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
     cleaner.flush()
-    pose = cleaner(joints[2, 0], 1.0)
+    _, pose = cleaner(joints[2, 0], 2 / 30), cleaner(joints[3, 0], 3 / 30)
     assert pose is not None
     np.testing.assert_allclose(pose.world["head"], pose.positions["head"], atol=0.15)
 
