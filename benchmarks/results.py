@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -43,6 +43,15 @@ class Table:
     """cells, ready to print"""
     note: str = ""
     """conditions that a reader must know"""
+
+    @classmethod
+    def of(
+        cls, name: str, title: str, records: Iterable[Mapping[str, Any]], cells: Mapping[str, str], note: str = ""
+    ) -> Table:
+        """Build a table with a row for each record; ``cells`` are the columns' formats, such as ``{mm:.1f}``, by
+        header."""
+        rows = [[cell.format_map(record) for cell in cells.values()] for record in records]
+        return cls(name, title, list(cells), rows, note)
 
 
 @dataclass(frozen=True)

@@ -229,29 +229,18 @@ def _table(records: list[dict[str, Any]], ratios: list[dict[str, Any]], clips: i
 
 
 def _search_table(records: list[dict[str, Any]]) -> Table:
-    return Table(
-        name="completion-search",
-        title="HM-VAE of 64 frames searched for a body that meets what is known (HM-VAE, section 4)",
-        columns=["hidden", "method", "mm off", "acceleration, of the true", "s a window"],
-        rows=[
-            [
-                r["hidden"],
-                r["method"],
-                f"{r['hidden_mm']:.0f}",
-                f"{r['acceleration_of_true']:.2f}",
-                f"{r['seconds']:.2f}",
-            ]
-            for r in records
-        ],
-        note=f"{records[0]['windows']} of the windows.",
-    )
+    return Table.of(
+        "completion-search", "HM-VAE of 64 frames searched for a body that meets what is known (HM-VAE, section 4)",
+        records,
+        {"hidden": "{hidden}", "method": "{method}", "mm off": "{hidden_mm:.0f}",
+         "acceleration, of the true": "{acceleration_of_true:.2f}", "s a window": "{seconds:.2f}"},
+        f"{records[0]['windows']} of the windows.",
+    )  # fmt: skip
 
 
 def _usual_table(records: list[dict[str, Any]]) -> Table:
-    return Table(
-        name="completion-usual",
-        title="The mean pose in place of every frame (the trivial row of HM-VAE, table 3)",
-        columns=["known of each frame", "MPJPE, mm", "PA-MPJPE, mm"],
-        rows=[[r["known"], f"{r['position_mm']:.1f}", f"{r['aligned_mm']:.1f}"] for r in records],
-        note=f"The windows of completion, of {FRAMES} frames, on the person's bones and with the pelvis at the origin.",
-    )
+    return Table.of(
+        "completion-usual", "The mean pose in place of every frame (the trivial row of HM-VAE, table 3)", records,
+        {"known of each frame": "{known}", "MPJPE, mm": "{position_mm:.1f}", "PA-MPJPE, mm": "{aligned_mm:.1f}"},
+        f"The windows of completion, of {FRAMES} frames, on the person's bones and with the pelvis at the origin.",
+    )  # fmt: skip

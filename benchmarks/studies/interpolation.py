@@ -9,7 +9,6 @@ section 4.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -237,49 +236,28 @@ def search(bench: Bench, clips: MotionClips, completer: LiveCompleter, deviation
 
 
 def _table(records: list[dict[str, Any]], clips: int) -> Table:
-    columns: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
-        "l2q": ("L2Q", lambda r: f"{r['l2q']:.3f}"),
-        "l2q_of_line": ("of slerp's", lambda r: f"{r['l2q_of_line']:.2f}"),
-        "l2p": ("L2P", lambda r: f"{r['l2p']:.3f}"),
-        "l2p_of_line": ("of lerp's", lambda r: f"{r['l2p_of_line']:.2f}"),
-        "npss": ("NPSS", lambda r: f"{r['npss']:.3f}"),
-        "position": ("MPJPE, mm", lambda r: f"{r['position_mm']:.1f}"),
-        "local": ("about the root, mm", lambda r: f"{r['local_mm']:.1f}"),
-        "acceleration": ("acceleration, of the true", lambda r: f"{r['acceleration_of_true']:.2f}"),
-        "missed": ("its error, mm/frame²", lambda r: f"{r['acceleration_mm']:.2f}"),
-        "skate": ("feet that stand, m/s", lambda r: f"{r['skate_m_s']:.3f}"),
-    }
-    rows = sorted(records, key=lambda r: r["gap"])
-    return Table(
-        name="interpolation",
-        title="Motion in gaps, 10 frames known before and one after (HM-VAE, table 2)",
-        columns=["method", "gap, frames", *(text for text, _ in columns.values())],
-        rows=[[r["method"], str(r["gap"]), *(cell(r) for _, cell in columns.values())] for r in rows],
-        note=(
-            f"{clips} clips, spread evenly over the sources. Baselines have the rotations of the file; where joints "
-            "are given, those solved from them, as the completer. On LAFAN1, which is another skeleton and motion, "
-            "the two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56, 0.70 of slerp's L2Q at 5, 15, 30 and "
-            "45 frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's."
-        ),
-    )
+    return Table.of(
+        "interpolation", "Motion in gaps, 10 frames known before and one after (HM-VAE, table 2)",
+        sorted(records, key=lambda r: r["gap"]),
+        {"method": "{method}", "gap, frames": "{gap}", "L2Q": "{l2q:.3f}", "of slerp's": "{l2q_of_line:.2f}",
+         "L2P": "{l2p:.3f}", "of lerp's": "{l2p_of_line:.2f}", "NPSS": "{npss:.3f}", "MPJPE, mm": "{position_mm:.1f}",
+         "about the root, mm": "{local_mm:.1f}", "acceleration, of the true": "{acceleration_of_true:.2f}",
+         "its error, mm/frame²": "{acceleration_mm:.2f}", "feet that stand, m/s": "{skate_m_s:.3f}"},
+        f"{clips} clips, spread evenly over the sources. Baselines have the rotations of the file; where joints "
+        "are given, those solved from them, as the completer. On LAFAN1, which is another skeleton and motion, "
+        "the two-stage transformer of Qin et al. 2022 has 0.45, 0.46, 0.56, 0.70 of slerp's L2Q at 5, 15, 30 and "
+        "45 frames, and 0.28, 0.32, 0.39 and 0.49 of lerp's L2P; HM-VAE 1.09, 0.87, 0.96 and 1.00 of slerp's.",
+    )  # fmt: skip
 
 
 def _search_table(records: list[dict[str, Any]]) -> Table:
     rows = [r for r in sorted(records, key=lambda r: r["gap"]) if r["method"] != "truth"]
-    return Table(
-        name="interpolation-search",
-        title="HM-VAE of 64 frames searched for a motion that meets what is known (HM-VAE, section 4)",
-        columns=[
-            "method", "gap, frames", "L2Q", "of slerp's", "MPJPE, mm", "about the root, mm",
-            "acceleration, of the true", "s a clip",
-        ],
-        rows=[
-            [
-                r["method"], str(r["gap"]), f"{r['l2q']:.3f}", f"{r['l2q_of_line']:.2f}", f"{r['position_mm']:.1f}",
-                f"{r['local_mm']:.1f}", f"{r['acceleration_of_true']:.2f}",
-                f"{r['seconds']:.2f}" if "seconds" in r else "",
-            ]
-            for r in rows
-        ],
-        note=f"{rows[0]['clips']} of the clips; equation 14 over the latents, then equation 15 over the decoder too.",
+    return Table.of(
+        "interpolation-search",
+        "HM-VAE of 64 frames searched for a motion that meets what is known (HM-VAE, section 4)",
+        [{**r, "spent": f"{r['seconds']:.2f}" if "seconds" in r else ""} for r in rows],
+        {"method": "{method}", "gap, frames": "{gap}", "L2Q": "{l2q:.3f}", "of slerp's": "{l2q_of_line:.2f}",
+         "MPJPE, mm": "{position_mm:.1f}", "about the root, mm": "{local_mm:.1f}",
+         "acceleration, of the true": "{acceleration_of_true:.2f}", "s a clip": "{spent}"},
+        f"{rows[0]['clips']} of the clips; equation 14 over the latents, then equation 15 over the decoder too.",
     )  # fmt: skip

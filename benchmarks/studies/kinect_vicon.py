@@ -237,43 +237,22 @@ def _by_delay(
 
 
 def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: Sequence[str]) -> Table:
-    body = []
-    for record in records:
-        low, high = record["position_ci_mm"]
-        moving_low, moving_high = record["moving_ci_mm"]
-        acceleration_low, acceleration_high = record["acceleration_ci_mm"]
-        body.append(
-            [
-                record["method"],
-                "offline" if record["delay"] == OFFLINE else str(record["delay"]),
-                f"{record['position_mm']:.1f} ({low:.1f}–{high:.1f})",
-                f"{record['moving_mm']:.1f} ({moving_low:.1f}–{moving_high:.1f})",
-                *(f"{record['groups'][subject]['position_mm']:.1f}" for subject in subjects),
-                f"{record['acceleration_mm']:.2f} ({acceleration_low:.2f}–{acceleration_high:.2f})",
-                f"{record['bone_variation_percent']:.1f}",
-            ]
-        )
-    return Table(
-        name="kinect_vicon",
-        title="Real Kinect against Vicon: UI-PRMD, each person left out in turn",
-        columns=[
-            "method",
-            "delay, frames",
-            "position, mm",
-            "clip's offset off",
-            *subjects,
-            "acceleration, mm/frame²",
-            "bone length, %",
-        ],
-        rows=body,
-        note=(
-            f"{len(clips)} clips, 13 joints, 30 Hz; in brackets, the 95 % interval by bootstrap over clips. One "
-            "rotation and translation a clip, then a constant offset a joint in the trunk's frame, which every method "
-            "learns on the other people. Filters have the parameters that are best for the others, of one search. "
-            "Bone length: standard deviation by mean. Clip's offset off: without each joint's constant offset of that "
-            f"very clip. {_NO_MEAN}."
-        ),
-    )
+    return Table.of(
+        "kinect_vicon", "Real Kinect against Vicon: UI-PRMD, each person left out in turn",
+        [{**r, "delay": "offline" if r["delay"] == OFFLINE else r["delay"]} for r in records],
+        {"method": "{method}", "delay, frames": "{delay}",
+         "position, mm": "{position_mm:.1f} ({position_ci_mm[0]:.1f}–{position_ci_mm[1]:.1f})",
+         "clip's offset off": "{moving_mm:.1f} ({moving_ci_mm[0]:.1f}–{moving_ci_mm[1]:.1f})",
+         **{subject: f"{{groups[{subject}][position_mm]:.1f}}" for subject in subjects},
+         "acceleration, mm/frame²":
+             "{acceleration_mm:.2f} ({acceleration_ci_mm[0]:.2f}–{acceleration_ci_mm[1]:.2f})",
+         "bone length, %": "{bone_variation_percent:.1f}"},
+        f"{len(clips)} clips, 13 joints, 30 Hz; in brackets, the 95 % interval by bootstrap over clips. One "
+        "rotation and translation a clip, then a constant offset a joint in the trunk's frame, which every method "
+        "learns on the other people. Filters have the parameters that are best for the others, of one search. "
+        "Bone length: standard deviation by mean. Clip's offset off: without each joint's constant offset of that "
+        f"very clip. {_NO_MEAN}.",
+    )  # fmt: skip
 
 
 def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:

@@ -243,28 +243,19 @@ def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, fl
 
 
 def _table(records: list[dict[str, Any]], clips: int) -> Table:
-    keys = {
-        "position_mm": ("joints, mm", 1), "legs_mm": ("legs, mm", 1), "root_mm": ("root, mm", 1),
-        "acceleration_mm": ("acceleration error, mm/frame²", 2), "left_skate_m_s": ("left foot, m/s", 3),
-        "right_skate_m_s": ("right foot, m/s", 3), "left_skating_percent": ("left skates, %", 1),
-        "right_skating_percent": ("right skates, %", 1), "penetration_percent": ("under the floor, %", 1),
-    }  # fmt: skip
-    return Table(
-        name="world",
-        title="In the world, through noise of 2 cm that lasts: place, pose and standing feet",
-        columns=["method", "delay, frames", *(text for text, _ in keys.values())],
-        rows=[
-            [r["method"], str(r["delay"]), *(f"{r[key]:.{digits}f}" for key, (_, digits) in keys.items())]
-            for r in records
-        ],
-        note=(
-            f"The {clips} clips of {FRAMES} frames that travel farthest, floor known, no alignment. "
-            "Feet: mean horizontal speed of ankle and toe in frames in which they stand in truth; skating: faster than "
-            f"{SKATING:.2f} m/s; under the floor: frames in which a sole (heel {1e3 * SOLE[0]:.0f}, toe "
-            f"{1e3 * SOLE[2]:.0f} mm under its joint) is, by more than {1e3 * UNDER:.0f} mm. "
-            "Baselines tuned on every third clip with other noise."
-        ),
-    )
+    return Table.of(
+        "world", "In the world, through noise of 2 cm that lasts: place, pose and standing feet", records,
+        {"method": "{method}", "delay, frames": "{delay}", "joints, mm": "{position_mm:.1f}",
+         "legs, mm": "{legs_mm:.1f}", "root, mm": "{root_mm:.1f}",
+         "acceleration error, mm/frame²": "{acceleration_mm:.2f}", "left foot, m/s": "{left_skate_m_s:.3f}",
+         "right foot, m/s": "{right_skate_m_s:.3f}", "left skates, %": "{left_skating_percent:.1f}",
+         "right skates, %": "{right_skating_percent:.1f}", "under the floor, %": "{penetration_percent:.1f}"},
+        f"The {clips} clips of {FRAMES} frames that travel farthest, floor known, no alignment. "
+        "Feet: mean horizontal speed of ankle and toe in frames in which they stand in truth; skating: faster than "
+        f"{SKATING:.2f} m/s; under the floor: frames in which a sole (heel {1e3 * SOLE[0]:.0f}, toe "
+        f"{1e3 * SOLE[2]:.0f} mm under its joint) is, by more than {1e3 * UNDER:.0f} mm. "
+        "Baselines tuned on every third clip with other noise.",
+    )  # fmt: skip
 
 
 def _root_table(by_speed: Mapping[str, Mapping[str, float]]) -> Table:

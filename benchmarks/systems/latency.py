@@ -40,6 +40,9 @@ DEPENDS_ON = WORLD
 RECORDING = ROOT / "sim_data" / "walk_turn"
 CROWDS = (1, 4, 8)
 LIVE_CROWDS = (1, 2, 4, 8, 16, 32)
+LATENCIES = {"p50": "{latency_ms[p50]:.1f}", "p95": "{latency_ms[p95]:.1f}", "p99": "{latency_ms[p99]:.1f}",
+             "longest": "{latency_ms[max]:.1f}"}  # fmt: skip
+"""Columns of a table of latencies."""
 LATEST_MS = 150.0
 """Largest 99th percentile of the latency of a pose of the newest frame, milliseconds, whatever the load."""
 SPACING = 0.8
@@ -185,26 +188,18 @@ def recorded() -> list[PoseRaw]:
 
 
 def _compute_table(results: list[dict[str, Any]], numpy: float) -> Table:
-    clocks = ("prior_wall_ms", "prior_cpu_ms", "trajectory_wall_ms")
-    return Table(
-        name="compute",
-        title="Compute a frame on one core, ms",
-        columns=[
-            "bodies",
-            *(f"{c.removesuffix('_ms').replace('_', ', ')}, {p}" for c in clocks for p in ("p50", "p99")),
-            "prior, cpu, p50, of numpy's",
-        ],
-        rows=[
-            [
-                str(r["bodies"]),
-                *(f"{r[c][p]:.2f}" for c in clocks for p in ("p50", "p99")),
-                f"{r['prior_cpu_ms']['p50'] / numpy:.1f}",
-            ]
-            for r in results
-        ],
-        note=f"{results[0]['frames']} frames; cpu: the thread's processor time, which other processes do not lengthen. "
+    cells = {"bodies": "{bodies}"} | {
+        f"{clock.replace('_', ', ')}, {p}": f"{{{clock}_ms[{p}]:.2f}}"
+        for clock in ("prior_wall", "prior_cpu", "trajectory_wall")
+        for p in ("p50", "p99")
+    }
+    return Table.of(
+        "compute", "Compute a frame on one core, ms",
+        [{**r, "ratio": r["prior_cpu_ms"]["p50"] / numpy} for r in results],
+        {**cells, "prior, cpu, p50, of numpy's": "{ratio:.1f}"},
+        f"{results[0]['frames']} frames; cpu: the thread's processor time, which other processes do not lengthen. "
         f"numpy's: 30 steps of a Kalman filter of 44 states in numpy, {numpy:.2f} ms here; what machines differ by.",
-    )
+    )  # fmt: skip
 
 
 def carried(results: list[dict[str, Any]]) -> int:
@@ -216,23 +211,16 @@ def carried(results: list[dict[str, Any]]) -> int:
 
 
 def _live_table(results: list[dict[str, Any]]) -> Table:
-    return Table(
-        name="live",
-        title="From capture to pose/world at 30 Hz, less the delay, ms, against the number of bodies",
-        columns=["bodies", "p50", "p95", "p99", "longest", "frames", "dropped", "bodies answered", "in time"],
-        rows=[
-            [
-                str(r["bodies"]),
-                *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
-                str(r["expected"]),
-                str(r["expected"] - r["arrived"]),
-                f"{r['bodies_answered']:.1f}",
-                "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
-            ]
-            for r in results
-        ],
-        note="Three node processes and this subscriber, live transport. Where there is no time for all, the bodies "
+    answers = [
+        {**r, "dropped": r["expected"] - r["arrived"], "timely": "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no"}
+        for r in results
+    ]
+    return Table.of(
+        "live", "From capture to pose/world at 30 Hz, less the delay, ms, against the number of bodies", answers,
+        {"bodies": "{bodies}", **LATENCIES, "frames": "{expected}", "dropped": "{dropped}",
+         "bodies answered": "{bodies_answered:.1f}", "in time": "{timely}"},
+        "Three node processes and this subscriber, live transport. Where there is no time for all, the bodies "
         "farthest from the sensor are left out, and then frames, the newest of which are worked on first: in time is a "
         f"p99 of {LATEST_MS:g} ms. This machine carries "
         f"{carried(results)} bodies, all answered in 99 of 100 frames.",
-    )
+    )  # fmt: skip

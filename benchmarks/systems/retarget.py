@@ -102,29 +102,27 @@ def _table(found: dict[str, dict[str, Any]], numpy: float) -> Table:
     frames = [one["frames"] for one in found.values()]
     total = {"frames": sum(frames), "standing": np.average([one["standing"] for one in found.values()], weights=frames)}
     every = {"cpu_ms": [ms for one in found.values() for ms in one["cpu_ms"]]}
-    rows = []
+    records = []
     for name, one in [*found.items(), (ALL, total | every | worst)]:
         p50, p99 = np.percentile(one["cpu_ms"], (50, 99))
-        measures = f"{p50:.2f}", f"{p99:.2f}", f"{p50 / numpy:.2f}", f"{one['breach_rad']:.4f}", f"{one['speed']:.2f}"
-        feet = f"{one['foot_mm']:.1f}", f"{one['deep_mm']:.1f}", f"{one['standing']:.0f}"
-        rows.append([name, str(one["frames"]), *measures, *feet])
-    return Table(
-        name="retarget",
-        title="One person to a robot of 29 joints: a frame's processor time, limits, standing feet",
-        columns=[
-            "stream",
-            "frames",
-            "cpu, p50, ms",
-            "cpu, p99, ms",
-            "p50, of numpy's",
-            "worst breach of a range, rad",
-            "fastest joint, of its limit",
-            "standing foot, at most, mm",
-            "foot below the floor, at most, mm",
-            "some foot stands, % of frames",
-        ],
-        rows=rows,
-        note="`launch/robots/humanoid29.urdf`. cpu: the thread's processor time, which other processes do not "
+        records.append({"stream": name, "p50": p50, "p99": p99, "ratio": p50 / numpy, **one})
+    return Table.of(
+        "retarget",
+        "One person to a robot of 29 joints: a frame's processor time, limits, standing feet",
+        records,
+        {
+            "stream": "{stream}",
+            "frames": "{frames}",
+            "cpu, p50, ms": "{p50:.2f}",
+            "cpu, p99, ms": "{p99:.2f}",
+            "p50, of numpy's": "{ratio:.2f}",
+            "worst breach of a range, rad": "{breach_rad:.4f}",
+            "fastest joint, of its limit": "{speed:.2f}",
+            "standing foot, at most, mm": "{foot_mm:.1f}",
+            "foot below the floor, at most, mm": "{deep_mm:.1f}",
+            "some foot stands, % of frames": "{standing:.0f}",
+        },
+        "`launch/robots/humanoid29.urdf`. cpu: the thread's processor time, which other processes do not "
         "lengthen, in frames that show somebody. numpy's: 30 steps of a Kalman filter of 44 states in numpy on the "
         f"same core, {numpy:.2f} ms; compare machines by the ratio. Foot: how far it is from where it came to stand.",
     )

@@ -20,7 +20,16 @@ import numpy as np
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.systems.latency import LATEST_MS, RECORDING, WARM_UP, WARM_UP_S, crowd, percentiles, recorded
+from steadypose.benchmarks.systems.latency import (
+    LATENCIES,
+    LATEST_MS,
+    RECORDING,
+    WARM_UP,
+    WARM_UP_S,
+    crowd,
+    percentiles,
+    recorded,
+)
 from steadypose.benchmarks.systems.running import START_S, running_nodes
 from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
@@ -155,53 +164,37 @@ def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
 
 
 def _live_table(lived: list[dict[str, Any]]) -> Table:
-    return Table(
-        name="scale_live",
-        title="A server's clients, from capture to pose/world at 30 Hz, less the delay, ms",
-        columns=["clients", "p50", "p95", "p99", "longest", "answered, %", "in time"],
-        rows=[
-            [
-                str(r["clients"]),
-                *(f"{r['latency_ms'][p]:.1f}" for p in ("p50", "p95", "p99", "max")),
-                f"{100 * r['answered'] / r['sent']:.1f}",
-                "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
-            ]
-            for r in lived
-        ],
-        note="One body a client, score and imputation off. Answered: a client's messages that came back with its body. "
+    clients = [
+        {
+            **r,
+            "share": 100 * r["answered"] / r["sent"],
+            "timely": "yes" if r["latency_ms"]["p99"] <= LATEST_MS else "no",
+        }
+        for r in lived
+    ]
+    return Table.of(
+        "scale_live", "A server's clients, from capture to pose/world at 30 Hz, less the delay, ms", clients,
+        {"clients": "{clients}", **LATENCIES, "answered, %": "{share:.1f}", "in time": "{timely}"},
+        "One body a client, score and imputation off. Answered: a client's messages that came back with its body. "
         f"In time: a p99 of {LATEST_MS:g} ms, for what is answered.",
-    )
+    )  # fmt: skip
 
 
 def _table(served: list[dict[str, Any]], cleaned: dict[str, float], numpy: float) -> Table:
     most = _streams_a_core(served)
-    return Table(
-        name="scale",
-        title="A server's processor time a period of 33.3 ms, ms",
-        columns=[
-            "clients",
-            "score, impute",
-            "prior, p50",
-            "prior, p99",
-            "a client",
-            "of numpy's",
-            "trajectory, p50",
-            "p99",
-        ],
-        rows=[
-            [
-                str(s["clients"]),
-                "on" if s["hgvae"] else "off",
-                *(f"{s['prior_ms'][p]:.1f}" for p in ("p50", "p99")),
-                f"{s['prior_ms']['p50'] / s['clients']:.2f}",
-                f"{s['prior_ms']['p50'] / s['clients'] / numpy:.2f}",
-                *(f"{s['trajectory_ms'][p]:.1f}" for p in ("p50", "p99")),
-            ]
-            for s in served
-        ],
-        note="One body a client. In time 99 of 100 periods, on a core: "
+    periods = [
+        {**s, "networks": "on" if s["hgvae"] else "off", "share": s["prior_ms"]["p50"] / s["clients"],
+         "ratio": s["prior_ms"]["p50"] / s["clients"] / numpy}
+        for s in served
+    ]  # fmt: skip
+    return Table.of(
+        "scale", "A server's processor time a period of 33.3 ms, ms", periods,
+        {"clients": "{clients}", "score, impute": "{networks}", "prior, p50": "{prior_ms[p50]:.1f}",
+         "prior, p99": "{prior_ms[p99]:.1f}", "a client": "{share:.2f}", "of numpy's": "{ratio:.2f}",
+         "trajectory, p50": "{trajectory_ms[p50]:.1f}", "p99": "{trajectory_ms[p99]:.1f}"},
+        "One body a client. In time 99 of 100 periods, on a core: "
         f"{most['prior without']} clients for the prior without score and imputation, {most['prior']} with, and "
         f"{most['trajectory']} for the trajectory, which is not batched. `clean` does {cleaned['rate']:.1f} s of a "
         f"stream of one body a second and core. A client's is also given in units of 30 steps of a Kalman filter of 44 "
         f"states in numpy, {numpy:.2f} ms here: what machines differ by.",
-    )
+    )  # fmt: skip
