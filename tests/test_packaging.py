@@ -1,5 +1,3 @@
-"""The wrapper works where the caller stands; a wheel holds one package, with all that running takes."""
-
 import os
 import shutil
 import subprocess
@@ -48,7 +46,6 @@ def test_the_wrapper_runs_where_the_caller_stands(checkout: Path, tmp_path: Path
 def test_a_python_that_cannot_be_used_is_not_taken(
     checkout: Path, tmp_path: Path, version: tuple[int, int] | None
 ) -> None:
-    """Neither another version's, nor a stub that does not run."""
     shutil.rmtree(checkout / ".venv")
     names = tmp_path / "bin"
     names.mkdir()

@@ -1,5 +1,3 @@
-"""A small part of the bench, as a check against regression: wide tolerances, people of our own simulator."""
-
 from dataclasses import replace
 from pathlib import Path
 

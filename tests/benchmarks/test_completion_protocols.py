@@ -1,5 +1,3 @@
-"""Interpolation and completion: figures that say what they should, baselines that do what their names say."""
-
 from pathlib import Path
 
 import numpy as np

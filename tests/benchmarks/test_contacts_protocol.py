@@ -1,5 +1,3 @@
-"""The protocol of force plates, on a recording made here: a foot that stands, and one that is lifted."""
-
 from pathlib import Path
 
 import numpy as np

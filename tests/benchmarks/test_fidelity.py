@@ -1,5 +1,3 @@
-"""The fidelity protocol's motion, noise and figures."""
-
 from pathlib import Path
 
 import numpy as np

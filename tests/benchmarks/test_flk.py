@@ -1,5 +1,3 @@
-"""FLK: what it follows, what it predicts, and that known bones stay as long as they are."""
-
 import numpy as np
 import torch
 from torch import Tensor, nn

@@ -1,5 +1,3 @@
-"""HuMoR's tables: scores of answers that are known, and the whole protocol in small."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Means over people and their intervals."""
-
 import numpy as np
 import pytest
 

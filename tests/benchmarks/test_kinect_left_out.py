@@ -153,9 +153,7 @@ def test_each_clip_gets_its_own_frames_of_the_scored_joints(monkeypatch: pytest.
         np.testing.assert_array_equal(told.flagged, made.flagged[:count, number])
 
 
-def test_a_sensors_correction_is_judged_by_whom_it_was_not_learned_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensors_correction_is_judged_by_whom_it_was_not_learned_of(tmp_path: Path, monkeypatch) -> None:
     # what is missing is known where the sensor has one joint 8 cm off: a correction of half of it leaves half
     seen, off = to_canonical(KINECT22, pair("s01", 0, "").kinect)[0], np.zeros((22, 3))
     off[J["left_wrist"]] = [0.0, 0.0, 0.08]

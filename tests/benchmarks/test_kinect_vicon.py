@@ -192,9 +192,7 @@ def test_what_is_the_same_for_all_is_run_once_and_each_clip_gets_its_own() -> No
 
 
 @pytest.mark.parametrize(("quick", "steps"), [(True, 40), (False, 4000)])
-def test_a_correction_is_learned_of_the_others_once(
-    quick: bool, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_correction_is_learned_of_the_others_once(quick: bool, steps: int, tmp_path: Path, monkeypatch) -> None:
     asked: list[tuple] = []
 
     def train(options: TrainingOptions, subjects: tuple[str, ...]) -> None:
@@ -230,9 +228,7 @@ def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
     assert a["groups"]["done wrong"] == a["groups"]["s03"]
 
 
-def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers(tmp_path: Path, monkeypatch) -> None:
     names = ["spare", *{marker for markers in MARKERS.values() for marker in markers}]
     rng, shapes = np.random.default_rng(0), ((5, 22, 3), (5, 22, 3), (5, len(names), 3))
     pairs = [
@@ -253,9 +249,7 @@ def test_every_nth_clip_of_each_person_is_read_with_the_mean_of_a_joints_markers
 
 
 @pytest.mark.parametrize(("quick", "steps"), [(True, 60), (False, 1000)])
-def test_regressions_learn_what_the_best_filter_of_their_delay_leaves(
-    quick: bool, steps: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_regressions_learn_what_the_best_filter_of_their_delay_leaves(quick: bool, steps: int, monkeypatch) -> None:
     called: list[tuple[Any, ...]] = []
 
     def smoothed(clips: Sequence[np.ndarray], scored: Sequence[int], *given: Any) -> tuple[Any, ...]:

@@ -1,5 +1,3 @@
-"""The study of sensors' layouts."""
-
 import numpy as np
 import pytest
 

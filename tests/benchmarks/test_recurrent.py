@@ -1,5 +1,3 @@
-"""The whole-body denoiser among the baselines."""
-
 import numpy as np
 import pytest
 import torch

@@ -134,9 +134,7 @@ def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: 
     assert digests[0] == digests[1] != digests[2]
 
 
-def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(provenance, "uncommitted", lambda: ["prior/clean/fuse.py"])
     with pytest.raises(UncommittedError, match=r"fuse\.py.*--out"):
         save("latency", COMMAND, [TABLE], {}, PAPER)

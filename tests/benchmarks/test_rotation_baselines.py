@@ -1,5 +1,3 @@
-"""The baselines for rotations: closed forms of the Kalman filter, and what the network's output has to be."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

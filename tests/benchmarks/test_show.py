@@ -1,5 +1,3 @@
-"""Tables on a terminal of 80 columns."""
-
 import json
 
 import pytest

@@ -1,5 +1,3 @@
-"""Whatever can be said arrives as it was said; whatever else arrives is a `DecodeError` and costs no memory."""
-
 import contextlib
 import dataclasses
 import struct
@@ -164,7 +162,6 @@ ORIENTATION = np.array([0.1, -0.2, 0.3, 0.9])
 
 @pytest.mark.parametrize("topic", [POSE_RAW, POSE_CLEAN, POSE_WORLD])
 def test_a_quaternion_of_ros_has_its_names_in_our_order(topic: str):
-    """What another node writes by the names x, y, z and w is read in that order, and the reverse."""
     store, name = typestore(), wire_type(TOPICS[topic])
     wire = store.deserialize_cdr(PAYLOADS[topic], name)
     pose = wire.bodies[0].root_pose if topic == POSE_WORLD else wire.sensor_pose  # type: ignore[attr-defined]

@@ -1,5 +1,3 @@
-"""Real sockets: what a reliable subscriber has not taken, its heir is given; who never reads stops nobody for ever."""
-
 import time
 from pathlib import Path
 

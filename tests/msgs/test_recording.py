@@ -1,5 +1,3 @@
-"""A recording gives back what went in, in order, to us and to others; a broken one gives what is there, or an error."""
-
 import contextlib
 import dataclasses
 import struct
@@ -175,9 +173,7 @@ def test_an_error_while_recording_completes_it(tmp_path: Path):
 
 @given(data=st.data())
 @settings(max_examples=30)
-def test_a_truncated_recording_gives_what_is_there(
-    data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
-):
+def test_a_truncated_recording_gives_what_is_there(data: st.DataObject, whole: Path, tmp_path_factory):
     content = mcap_of(whole).read_bytes()
     size = data.draw(st.integers(0, len(content) - 1))
     cut = tmp_path_factory.mktemp("cut") / "cut.mcap"
@@ -306,9 +302,7 @@ def test_messages_that_cannot_be_decoded_are_counted(tmp_path: Path):
 
 @given(data=st.data())
 @settings(max_examples=20)
-def test_one_flipped_bit_costs_one_chunk_at_most(
-    data: st.DataObject, whole: Path, tmp_path_factory: pytest.TempPathFactory
-):
+def test_one_flipped_bit_costs_one_chunk_at_most(data: st.DataObject, whole: Path, tmp_path_factory):
     content = bytearray(mcap_of(whole).read_bytes())
     finished = data.draw(st.booleans())
     if not finished:  # as its writer leaves it when it is killed: without index
@@ -460,9 +454,7 @@ def test_the_oldest_parts_go_where_there_is_a_limit(tmp_path: Path):
         assert bag.message_count == len(found)
 
 
-def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_is_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_is_room(tmp_path: Path, monkeypatch):
     directory, everything, full = tmp_path / "recording", stream(), []
     with RecordingWriter(directory) as writer:
         flush = writer._part._writer.flush

@@ -1,5 +1,3 @@
-"""Who may publish and subscribe: folders that others may write to say nothing, and a secret key is its owner's."""
-
 import os
 import tempfile
 import threading
@@ -48,9 +46,7 @@ def test_a_directory_that_others_may_write_to_is_refused(tmp_path: Path, monkeyp
     ("use", "said"),
     [(make_private, "expected a directory of one's own"), (load_keys, "belongs to user .*: expected keys")],
 )
-def test_a_directory_of_somebody_else_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], object], said: str
-):
+def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch, use: Callable[[Path], object], said: str):
     create_keys(tmp_path)
     mine = os.getuid()
     if mine == 0:  # whose directories are trusted
@@ -105,7 +101,6 @@ def test_two_processes_that_make_the_keys_at_once_have_the_same(tmp_path: Path, 
 @pytest.mark.parametrize("part", [".", "clients", "servers"])
 @pytest.mark.parametrize("mode", [0o777, 0o702])
 def test_keys_in_a_folder_that_others_may_write_to_are_refused(tmp_path: Path, part: str, mode: int):
-    """They could let themselves in."""
     keys = tmp_path / "keys"
     create_keys(keys)
     (keys / "servers").mkdir()

@@ -1,5 +1,3 @@
-"""Real sockets: what is published arrives, what is lost is counted, and nobody is stopped by anybody."""
-
 import dataclasses
 import itertools
 import socket
@@ -516,9 +514,7 @@ def test_who_is_taken_off_the_list_is_put_out_and_who_is_added_let_in(key_direct
             assert put_out.receive(NEVER_S) is None
 
 
-def test_publishing_puts_out_who_is_taken_off_the_list(
-    key_directories: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
-):
+def test_publishing_puts_out_who_is_taken_off_the_list(key_directories: tuple[Path, Path, Path], monkeypatch):
     monkeypatch.setattr(publishing, "CHECK_S", 0.0)
     directory = key_directories[0]
     robot, guest, _ = (load_keys(directory) for directory in key_directories)

@@ -1,5 +1,3 @@
-"""The constructors refuse what has not the form they document, by name; the definitions say the same as the classes."""
-
 import dataclasses
 from typing import Any
 

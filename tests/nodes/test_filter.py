@@ -1,5 +1,3 @@
-"""Frame by frame: the same numbers as the nodes' pipelines and `clean`, bodies by number, joints by name."""
-
 import re
 from pathlib import Path
 
@@ -103,7 +101,6 @@ def test_joints_by_name_or_number(first_alone: list[Poses]) -> None:
 
 
 def test_of_many_moments_the_names_are_of_joints_still() -> None:
-    """Not of time, where that has 22 rows as well."""
     named = ByName.of(np.arange(22 * 22 * 3.0).reshape(22, 22, 3), JOINTS, -2)
     np.testing.assert_array_equal(named["head"], np.asarray(named)[:, 15])
     assert type(named[0]) is np.ndarray
@@ -187,7 +184,6 @@ def test_a_camera_that_moves_says_so_with_every_frame(joints: np.ndarray) -> Non
 
 
 def test_the_library_is_above_all_commands() -> None:
-    """What both need lies below both: no module outside the library imports it."""
     own = re.compile(r"^\s*(from|import) steadypose\.nodes\.library", re.MULTILINE)
     others = [file for file in NODES.rglob("*.py") if NODES / "library" not in file.parents]
     assert not [file for file in others if own.search(file.read_text())]

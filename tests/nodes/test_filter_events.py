@@ -1,5 +1,3 @@
-"""Events frame by frame are those of the whole recording, each when it begins, holds and ends."""
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The pipeline on arrays is what ``steadypose clean`` does."""
-
 import csv
 import re
 import warnings
@@ -38,7 +36,6 @@ def test_it_gives_what_the_command_writes(tmp_path: Path) -> None:
 
 
 def test_several_bodies() -> None:
-    """As many as came, each as it is alone; one who is away for a while is not made up."""
     joints = np.stack([WALK, WALK + [3.0, 0.0, 0.0]], axis=1)
     joints[:30, 1] = np.nan
     given = steadypose.clean(joints, fps=30.0)

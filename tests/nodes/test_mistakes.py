@@ -346,7 +346,6 @@ def test_without_a_library_of_tables_its_form_says_what_to_install(library: str,
     ],
 )
 def test_a_missing_extra_is_said_once(arguments: list[str], extra: str, tmp_path: Path, monkeypatch, capsys) -> None:
-    """The command is named by the command line, and not once more by what it misses."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)
     Path("in").mkdir()
@@ -360,7 +359,6 @@ def test_a_missing_extra_is_said_once(arguments: list[str], extra: str, tmp_path
 
 @pytest.mark.slow
 def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> None:
-    """Alone, and in a folder: the exit status says so."""
     (tmp_path / "in").mkdir()
     write_npz(tmp_path / "in" / "empty.npz", np.full((60, 1, 22, 3), np.nan))
     assert main(["clean", str(tmp_path / "in" / "empty.npz"), str(tmp_path / "out.npz")]) == 1

@@ -1,5 +1,3 @@
-"""`ros2/steadypose_ros`: its node in a ROS graph, driven by the services of a lifecycle, starts the real program."""
-
 import os
 import signal
 import subprocess

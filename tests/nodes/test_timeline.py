@@ -1,5 +1,3 @@
-"""Each event of a stream is listed once, with its begin and end."""
-
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Imports run one way: no circle of modules, no circle of rooms, and rooms import downwards only."""
-
 import ast
 from collections.abc import Mapping
 from functools import cache

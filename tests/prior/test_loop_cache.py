@@ -1,5 +1,3 @@
-"""Compiled loops on disk: found again, and compiled anew whatever became of the files."""
-
 import logging
 import os
 import subprocess
@@ -106,9 +104,7 @@ def test_it_is_compiled_anew_when_anything_that_it_is_made_of_changes(monkeypatc
     assert digest(calls) != first[1]
 
 
-def test_where_nothing_can_be_written_it_is_said_once_and_all_works(
-    tmp_path: Path, folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_where_nothing_can_be_written_it_is_said_once_and_all_works(tmp_path: Path, folder: Path, caplog) -> None:
     (tmp_path / "cache").write_text("in the way")
     with caplog.at_level(logging.WARNING):
         assert [njit(cache=True)(function)(1.0) for function in (add, add_more)] == [3.0, 4.0]

@@ -1,5 +1,3 @@
-"""Medians, of arrays and in loops, are numpy's."""
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,5 +1,3 @@
-"""What runs needs no torch: a whole stream, through both pipelines, in a process where there is none."""
-
 import re
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""Training the contact network: it learns what stands, resumes, and writes what the pipeline loads."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""What a sensor's correction is trained on, and that it learns it of whoever is there, left as right."""
-
 from pathlib import Path
 from typing import Any
 
@@ -122,9 +120,7 @@ def test_each_pose_is_held_against_what_is_missing_of_it(tmp_path: Path, monkeyp
     assert 0.005 < losses[0] < 0.1, "the noise on the inputs, and a fiftieth of them hidden"
 
 
-def test_a_kinects_correction_is_of_the_subjects_that_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kinects_correction_is_of_the_subjects_that_are_named(tmp_path: Path, monkeypatch) -> None:
     read: list[tuple[Path, str]] = []
 
     def load(data: Path, subjects: tuple[str, ...]) -> list[KinectPair]:

@@ -1,5 +1,3 @@
-"""Training by torchrun: two real processes, against the sum done by hand in this one."""
-
 import os
 import subprocess
 import sys

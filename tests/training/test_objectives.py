@@ -102,9 +102,7 @@ def value(loss: LossOf, done: float) -> tuple[float, dict[str, float]]:
     return found.item(), terms
 
 
-def test_hmvaes_kl_is_to_the_standard_normal_and_the_local_one_comes_late(
-    motion: MotionSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hmvaes_kl_is_to_the_standard_normal_and_the_local_one_comes_late(motion: MotionSet, monkeypatch) -> None:
     torch.manual_seed(0)
     model = HMVAE(HMVAEConfig(about_mean=True))
     with torch.no_grad():

@@ -1,5 +1,3 @@
-"""Training the trajectory network: what it is shown, how its errors are measured, and that what it writes loads."""
-
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +38,6 @@ def test_where_somebody_climbs_contacts_are_not_learned(prepared: Path):
 
 
 def test_windows_show_the_body_facing_forward(prepared: Path, monkeypatch: pytest.MonkeyPatch):
-    """Whatever way a clip goes, in the frame of the input the body moves along +x, and its left is at +y."""
     monkeypatch.setattr(training, "WINDOW", 40)
     monkeypatch.setattr(training, "_SPAN", 84)
     motion = MotionSet.load(prepared, "default", "train")

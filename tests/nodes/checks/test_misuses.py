@@ -267,8 +267,6 @@ def test_a_short_hold_up_is_no_clock_that_was_set() -> None:
 
 
 class TestNode:
-    """What the prior node makes of it."""
-
     @pytest.fixture
     def node(self, make_launch: Callable[..., Launch], clock: VirtualClock) -> PriorNode:
         clock.time_ns = START_NS
@@ -290,9 +288,7 @@ class TestNode:
         assert not from_values(news.values)
 
     @pytest.mark.parametrize("rate", [0, 1])
-    def test_as_fast_as_possible_stamps_and_clock_part(
-        self, make_launch: Callable[..., Launch], clock: VirtualClock, rate: int
-    ) -> None:
+    def test_as_fast_as_possible_stamps_and_clock_part(self, make_launch, clock: VirtualClock, rate: int) -> None:
         node = PriorNode(make_launch(nodes='["pose_input", "prior"]', input__rate=rate), clock)
         clock.time_ns, frames = START_NS, walk(2.0)
         self.play(node, clock, frames[:40])
@@ -320,9 +316,7 @@ class TestNode:
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "pose_input" in from_values(node.diagnostics().values)["no_source"]
 
-    def test_a_launch_file_s_own_source_that_never_came(
-        self, make_launch: Callable[..., Launch], clock: VirtualClock
-    ) -> None:
+    def test_a_launch_file_s_own_source_that_never_came(self, make_launch, clock: VirtualClock) -> None:
         node = PriorNode(make_launch(nodes='["pose_input", "prior"]'), clock)
         clock.time_ns += 11 * SECOND_NS
         assert "see what pose_input reports" in from_values(node.diagnostics().values)["no_source"]

@@ -1,5 +1,3 @@
-"""`steadypose clean DIR OUT`: all of a folder, many at once, and what is left of it after a stop."""
-
 import json
 import os
 from collections.abc import Iterator

@@ -1,5 +1,3 @@
-"""``steadypose calibrate`` from pictures on disk to a launch file that sends calibrated poses."""
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,9 +35,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_board_lens_and_pose_end_in_the_launch_file(
-    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_board_lens_and_pose_end_in_the_launch_file(pictures: Path, tmp_path: Path, capsys) -> None:
     launch = tmp_path / "kitchen.toml"
     launch.write_text('# our kitchen\n[input]\nsource = "oak" # by the window\n\n[prior]\ndelay = 2\n')
     square = str(BOARD.square)
@@ -125,9 +121,7 @@ def _pixel(point: np.ndarray) -> np.ndarray:
         (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "{folder}/no/x.png"], "x.png cannot be written"),
     ],
 )
-def test_what_cannot_be_done_is_said(
-    arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_done_is_said(arguments: list[str], complaint: str, tmp_path: Path, capsys) -> None:
     launch, lens = tmp_path / "kitchen.toml", tmp_path / "hall.toml"
     launch.write_text("")
     lens.write_text(LENS_TOLD)

@@ -1,5 +1,3 @@
-"""``steadypose calibrate sensor``: a sensor's own error is learned from recordings beside a reference."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""`steadypose clean`: what it writes, and at which stamps."""
-
 from pathlib import Path
 from typing import Any
 

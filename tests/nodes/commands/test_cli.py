@@ -1,5 +1,3 @@
-"""The command: what it lists, what it imports, and how it fails."""
-
 import subprocess
 import sys
 from importlib.util import find_spec

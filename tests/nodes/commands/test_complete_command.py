@@ -1,5 +1,3 @@
-"""`steadypose complete`: what it fills in, what it leaves, and what it says."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""The doctor: what is found on a machine that lacks something, and the exit status."""
-
 import importlib.metadata
 import subprocess
 import sys
@@ -33,10 +31,7 @@ def check_broken() -> Iterator[Finding]:
 
 
 @pytest.mark.parametrize("bad", [False, True])
-def test_exit_status_says_whether_the_main_job_can_run(
-    bad: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A check that breaks is a finding, and the others go on."""
+def test_exit_status_says_whether_the_main_job_can_run(bad: bool, monkeypatch, capsys) -> None:
     note = Finding("extra view", Verdict.NOTE, "not installed", "install [this]")
     monkeypatch.setattr(command, "CHECKS", (*([check_broken] if bad else []), lambda: iter([note])))
     assert doctor() == bad
@@ -65,9 +60,7 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
     assert packages.fix == INSTALL
 
 
-def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(monkeypatch, tmp_path: Path) -> None:
     pulled = command.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
     monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
     command.PROJECT.write_text(pulled)
@@ -198,9 +191,7 @@ def test_it_needs_nothing_that_it_looks_for() -> None:
         (False, "elsewhere", "pip install 'PATH/TO/CHECKOUT[view]'"),
     ],
 )
-def test_what_to_type_can_be_typed_here(
-    checkout: bool, prefix: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_to_type_can_be_typed_here(checkout: bool, prefix: str, command: str, tmp_path: Path, monkeypatch) -> None:
     if checkout:
         (tmp_path / "pyproject.toml").touch()
     monkeypatch.setattr(extras, "PACKAGE", tmp_path / "src" / "steadypose")

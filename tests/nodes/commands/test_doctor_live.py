@@ -1,5 +1,3 @@
-"""The doctor listens to a tracker that publishes, over a real socket."""
-
 import dataclasses
 from pathlib import Path
 

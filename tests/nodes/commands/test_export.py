@@ -1,5 +1,3 @@
-"""`steadypose export`: what is written is read back by other programs' libraries, where the body was."""
-
 from pathlib import Path
 from typing import Any
 

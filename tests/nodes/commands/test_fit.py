@@ -1,5 +1,3 @@
-"""`steadypose fit`: what it writes for recordings, arrays and key points, and what it says of what it cannot do."""
-
 from pathlib import Path
 
 import numpy as np

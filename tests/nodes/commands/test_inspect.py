@@ -1,5 +1,3 @@
-"""echo, hz and info: on recordings, and on topics over real sockets."""
-
 import itertools
 import re
 import threading

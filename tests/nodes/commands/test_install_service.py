@@ -1,5 +1,3 @@
-"""The service that is installed: what it may touch, what is refused beforehand, and what is done and undone."""
-
 import shutil
 import subprocess
 from pathlib import Path

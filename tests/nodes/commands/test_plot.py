@@ -1,5 +1,3 @@
-"""The picture of a recording: what is read for it, and that it is drawn whatever the recording has."""
-
 from collections.abc import Callable, Collection
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""What `clean` writes, everything reads: arrays and CSV through `plot`, `info`, `complete` and `clean` itself."""
-
 import re
 from pathlib import Path
 
@@ -122,7 +120,6 @@ def test_a_video_has_every_second_pose(cleaned: Path, name: str, start: bytes, t
 
 
 def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
-    """Who faces the viewer has the left hand on the viewer's right."""
     view = View(np.array([1.0, 0.0, 0.0]))  # in canonical axes the body's left is +y
     origin, up, left = view(np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
     assert up[1] > origin[1] + 0.9

@@ -1,5 +1,3 @@
-"""A damaged recording: what is lost is said, the rest is cleaned, or saved."""
-
 from pathlib import Path
 
 import pytest
@@ -22,9 +20,7 @@ def damaged(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_left_is_saved_and_what_is_lost_is_said(
-    damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_left_is_saved_and_what_is_lost_is_said(damaged: Path, tmp_path: Path, capsys) -> None:
     assert repair(damaged, tmp_path / "out") == 1
     assert "bytes in 1 places" in capsys.readouterr().out
     with RecordingReader(tmp_path / "out") as recording:

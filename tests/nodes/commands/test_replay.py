@@ -1,5 +1,3 @@
-"""The nodes over real sockets, and `clean` without any: the same stream gives the same messages, every time."""
-
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -47,9 +45,7 @@ def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
     return dict(found)
 
 
-def test_the_nodes_and_clean_give_the_same_bytes_every_time(
-    tmp_path: Path, stream: Path, make_launch: Callable[..., Launch]
-) -> None:
+def test_the_nodes_and_clean_give_the_same_bytes_every_time(tmp_path: Path, stream: Path, make_launch) -> None:
     """The second time the nodes play what they recorded the first time, which is as good as its source."""
     settings = {"nodes": NODES, "input.rate": "0"}
     for source, name in ((stream, "first"), (tmp_path / "first", "second")):

@@ -1,5 +1,3 @@
-"""Processes watched and started again, and what a run says of its nodes, and when it is over."""
-
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,5 +1,3 @@
-"""Too little data is said before a training starts; weights are installed only when asked, and the old ones kept."""
-
 from pathlib import Path
 
 import numpy as np

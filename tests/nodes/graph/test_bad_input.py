@@ -1,6 +1,3 @@
-"""Whatever comes in is counted by its cause, the next good frame is answered, what goes out keeps its promises, and one
-bad frame is over within a second."""
-
 import itertools
 from collections import Counter
 from collections.abc import Callable

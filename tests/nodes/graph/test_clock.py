@@ -1,5 +1,3 @@
-"""A clock that is set while nodes run: stamps follow it, and no wait, rate or restart does."""
-
 from collections.abc import Callable
 
 import pytest

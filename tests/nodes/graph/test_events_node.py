@@ -1,5 +1,3 @@
-"""The events node: what is sent when, and to whom the sensor belongs."""
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, cycle

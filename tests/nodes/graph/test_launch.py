@@ -1,5 +1,3 @@
-"""Launch files are read strictly, and say what to write instead."""
-
 from pathlib import Path
 
 import pytest
@@ -182,9 +180,7 @@ def test_brackets_without_end_are_no_setting(write) -> None:
         ("[prior.bones]\nevery = 4\nsamples = 40\n[prior.encode]", "delay=4", ["bones", "encode"]),
     ],
 )
-def test_former_names_mean_the_new_ones(
-    write, caplog: pytest.LogCaptureFixture, text: str, override: str, former: list[str]
-) -> None:
+def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str, former: list[str]) -> None:
     _warn_of_former_name.cache_clear()
     launch = Launch.read(write(text), [full_key(override, pipeline_sections())])
     assert launch.settings(PriorSettings).person == PersonSettings(samples=40, every=4)

@@ -1,5 +1,3 @@
-"""Counts go on over restarts, and what was published for a node that was away is a loss."""
-
 from collections.abc import Callable
 
 import pytest

@@ -1,5 +1,3 @@
-"""Under load: the newest first, fewer bodies before fewer frames, and nothing forgotten because of it."""
-
 import dataclasses
 from collections import deque
 from collections.abc import Sequence

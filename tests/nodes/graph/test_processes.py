@@ -1,5 +1,3 @@
-"""Real processes, broken on purpose: what is killed, stopped or in the way comes back, and nothing else stops."""
-
 import itertools
 import os
 import signal

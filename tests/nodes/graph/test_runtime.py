@@ -1,5 +1,3 @@
-"""What every node does: take, give, wait for its subscribers, count what went wrong, and say so."""
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""One server for several kiosks, over real sockets: each hears its own, by its own clock."""
-
 import dataclasses
 from collections import defaultdict
 from collections.abc import Callable
@@ -27,9 +25,7 @@ def kiosk(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
 
 
 @pytest.mark.parametrize("secret", [False, True])
-def test_two_kiosks_and_a_server(
-    make_launch: Callable[..., Launch], tmp_path: Path, clock: VirtualClock, secret: bool
-) -> None:
+def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualClock, secret: bool) -> None:
     streams = {"door": kiosk("door", 1, 0), "desk": kiosk("desk", 2, 3_600_000_000_000)}
     # kiosks and server have the same keys
     keys = create_keys(tmp_path / "keys") if secret else None

@@ -1,5 +1,3 @@
-"""Starting and stopping: a second time, beside another, on a full disk, and whatever asks for the end."""
-
 import json
 import os
 import signal
@@ -66,9 +64,7 @@ def test_a_second_run_is_refused_and_the_first_is_left_alone(start: Any, recordi
     assert not (folder / "steadypose" / HEALTH_FILE).exists()
 
 
-def test_locks_are_of_addresses_and_go_with_their_holder(
-    folder: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_locks_are_of_addresses_and_go_with_their_holder(folder: Path, make_launch, monkeypatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder / "runtime"))
     tcp = '{prior="tcp://127.0.0.1:7199"}'
     source = make_launch(nodes='["pose_input"]')
@@ -138,9 +134,7 @@ def test_beside_a_file_in_its_place_a_recording_is_made(start: Any, recording: P
         assert reader.count(POSE_RAW) == 91
 
 
-def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(
-    recording: Path, make_launch: Callable[..., Launch], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(recording: Path, make_launch, monkeypatch) -> None:
     monkeypatch.setenv(SUPERVISOR, str(os.getppid()))
     launch = make_launch(nodes='["pose_input"]', input__recording=recording, input__rate=0)
     node, heard = PoseInputNode(launch), set()

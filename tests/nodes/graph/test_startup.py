@@ -1,5 +1,3 @@
-"""What the start of a node takes, and leaves behind; and what an installation compiles is what the nodes run."""
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,6 +1,3 @@
-"""The declarations of the nodes and of the sources name what exists, and agree with each other; and those of another
-package, named in a launch file."""
-
 import dataclasses
 import subprocess
 import sys

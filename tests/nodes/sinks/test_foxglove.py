@@ -1,5 +1,3 @@
-"""Foxglove's WebSocket: what a client is offered, and gets."""
-
 import socket
 from collections.abc import Callable
 

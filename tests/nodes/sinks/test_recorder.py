@@ -1,5 +1,3 @@
-"""A recorder on a disk that fills: what it drops is counted, and what it wrote is whole."""
-
 import errno
 import shutil
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""REP-155: frames where the joints are, and angles that put the URDF's links there."""
-
 from xml.etree import ElementTree
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""A robot does as a person does, within its limits, and its feet stand; what is wrong with a URDF is said."""
-
 import json
 import socket
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""The ROS 2 bridge, heard by a real ROS 2 node (Jazzy's rclpy) in another process, and by a plain DDS one."""
-
 import dataclasses
 import json
 import re

@@ -1,5 +1,3 @@
-"""The viewer: what is drawn of a message, and the server that shows it."""
-
 import contextlib
 import importlib.util
 import itertools
@@ -269,9 +267,7 @@ class Server:
             raise RuntimeError("stopped")
 
 
-def test_the_node_draws_what_is_published_and_ends_with_its_server(
-    tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_node_draws_what_is_published_and_ends_with_its_server(tmp_path: Path, log: Log, monkeypatch) -> None:
     monkeypatch.setattr(viewer_server, "ViewerServer", Server)
     monkeypatch.setattr(viewer_node, "connect", lambda server: log)
     launch = Launch(transport=TransportSettings(directory=str(tmp_path)))

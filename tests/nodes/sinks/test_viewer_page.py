@@ -1,5 +1,3 @@
-"""The viewer's page in a headless Chromium: what it draws, and whom it calls."""
-
 import io
 import shutil
 import time

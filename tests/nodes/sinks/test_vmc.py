@@ -1,5 +1,3 @@
-"""The VMC sink: what a program that plays an avatar receives, decoded by the OSC library, gives the body back."""
-
 import dataclasses
 import socket
 from collections.abc import Callable

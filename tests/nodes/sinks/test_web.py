@@ -1,5 +1,3 @@
-"""The web sink at its socket: who is served, what is said, and what becomes of who is slow."""
-
 import http.client
 import json
 import stat

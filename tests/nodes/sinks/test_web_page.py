@@ -1,5 +1,3 @@
-"""The web page and the kiosk's in a headless Chromium: what they draw and say, and whom they call."""
-
 import dataclasses
 import io
 import shutil

@@ -1,5 +1,3 @@
-"""Messages of other trackers, made up as they give them, and what becomes of them."""
-
 from types import SimpleNamespace as Made
 
 import numpy as np
@@ -66,7 +64,6 @@ def test_mediapipe_bodies_stand_where_the_image_shows_them() -> None:
 
 
 def test_a_mediapipe_body_that_is_hardly_seen_is_left_out() -> None:
-    """Nobody can tell where it is: at the origin, in the camera, it certainly is not."""
     result = landmarker_result(standing(BLAZEPOSE33), standing(BLAZEPOSE33) + [1.0, 0.0, 0.0])
     for point in result.pose_world_landmarks[0][3:]:
         point.visibility = 0.1

@@ -1,5 +1,3 @@
-"""CSV files of poses: what they may say, what comes of it, and what is told of those that hold none."""
-
 from pathlib import Path
 
 import numpy as np

@@ -311,9 +311,7 @@ def test_a_camera_that_gives_nothing_says_so(monkeypatch: pytest.MonkeyPatch) ->
             capture(pipeline, player.outputs["depth"], player.outputs["depth"], None)
 
 
-def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(tmp_path: Path, monkeypatch, capsys) -> None:
     scene = moment(0)
     colour = np.zeros((*scene.depth.shape, 3), np.uint8)
     monkeypatch.setattr(oak_device, "capture_with_camera", lambda _: Still(colour, scene.depth, CAMERA.intrinsics, UP))

@@ -1,5 +1,3 @@
-"""The input node keeps the pace of the capture, on a clock that does not wait."""
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace

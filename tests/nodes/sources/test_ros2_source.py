@@ -1,5 +1,3 @@
-"""Skeletons from ROS 2 topics, published by a real ROS 2 node in another process."""
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

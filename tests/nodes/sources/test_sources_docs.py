@@ -1,5 +1,3 @@
-"""What docs/sources.md prints runs as it is printed."""
-
 import os
 import re
 import subprocess

@@ -1,5 +1,3 @@
-"""A sensor's pose from TF: the buffer against matrices, and a source whose messages wait for their transform."""
-
 from collections.abc import Callable
 from typing import Any
 

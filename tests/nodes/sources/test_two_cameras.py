@@ -1,5 +1,3 @@
-"""Two cameras to one source of bodies in the world, over real sockets."""
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Skeletons of motion files, recognised: each family as its program cuts a body, written and read back."""
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -111,7 +111,6 @@ def test_noisy_bones_come_nearer_to_how_this_body_holds_them() -> None:
 
 
 def test_a_bone_that_is_turned_far_is_followed() -> None:
-    """A head that looks down for a second is not held up."""
     vectors = np.zeros((FRAMES, 4, 3))
     vectors[-30:, 1, 1] = 1.0
     found = _followed(_turned(vectors), 0.005)

@@ -1,5 +1,3 @@
-"""The level of a camera from its accelerometer."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

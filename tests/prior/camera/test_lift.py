@@ -1,5 +1,3 @@
-"""Key points lifted by depth: flat people of which the answer is known, and simulated ones filmed by stereo."""
-
 from itertools import pairwise
 
 import cv2

@@ -1,5 +1,3 @@
-"""One wrong stamp is dropped; a jump that lasts costs nothing."""
-
 import dataclasses
 from collections import Counter
 from typing import Any

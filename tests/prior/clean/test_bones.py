@@ -1,5 +1,3 @@
-"""What bones tell: of the sensor, and of the person."""
-
 import numpy as np
 import pytest
 from tests.helpers.bodies import waving

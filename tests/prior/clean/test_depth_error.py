@@ -1,5 +1,3 @@
-"""What the deviations leave out of a sensor's error is read from bones, in whatever direction it errs."""
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

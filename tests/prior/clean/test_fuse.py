@@ -1,5 +1,3 @@
-"""What is fused of smoother, completion and bones, in closed form."""
-
 import numpy as np
 import pytest
 from tests.helpers.bodies import waving

@@ -1,5 +1,3 @@
-"""Limbs mirrored about the image plane, through the gate and the whole prior."""
-
 from collections import Counter
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""A camera that pans and drives, with its pose in every message, finds people as one that stands still does."""
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

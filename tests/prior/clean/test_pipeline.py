@@ -126,7 +126,6 @@ def test_a_perfect_input_stays_what_it_is(delay: int) -> None:
 
 
 def test_rotations_and_bones_place_the_joints_where_they_are_said_to_be() -> None:
-    """To what the person's bones are off by: joints seen stay where they are seen."""
     cleaned, _ = clean(stream(waving(40)))
     body = cleaned[-1].bodies[0]
     assert np.allclose(body.bone_lengths[0], 0)

@@ -1,5 +1,3 @@
-"""Many streams in one prior: each gets what it would get alone, whatever its clock, and whoever fails beside it."""
-
 import dataclasses
 import heapq
 
@@ -116,7 +114,6 @@ def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
 
 
 def test_frames_at_any_time_and_a_clock_that_drifts() -> None:
-    """Streams out of step are answered every frame, about when it was captured by their own clocks."""
     fast = kiosk("fast", 80, phase_ns=12_000_000)
     fast = [(now, dataclasses.replace(m, stamp_ns=m.stamp_ns + round(1e-4 * (now - NOW_NS)))) for now, m in fast]
     slow = kiosk("slower", 80, phase_ns=25_000_000)

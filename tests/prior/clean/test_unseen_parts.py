@@ -1,5 +1,3 @@
-"""Deviations of parts of the body of which no joint was ever observed."""
-
 import numpy as np
 
 from steadypose.prior.body.skeleton import J

@@ -1,5 +1,3 @@
-"""Completing whole recordings: what is known stays, nothing is left out, and windows leave no seams."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,5 +1,3 @@
-"""Each event begins when a body does that, and no sooner, no later, and not when its joints are too uncertain."""
-
 import dataclasses
 from collections.abc import Callable, Iterable
 
@@ -381,7 +379,6 @@ def test_who_stands_is_told_through_noise_that_no_single_frame_decides() -> None
 
 
 def test_a_hand_before_a_body_that_bends_down_is_not_raised() -> None:
-    """Above the neck it is, but so is every hand that is held forward."""
     bent = raised(standing())
     hips = bent[J["pelvis"]].copy()
     upper = [J[name] for name in ("spine1", "spine2", "spine3", "neck", "head")]

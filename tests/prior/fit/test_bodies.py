@@ -1,5 +1,3 @@
-"""Bodies of a cleaned stream: what of them is fitted, when a fit has failed, and the messages with fitted poses."""
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -200,9 +198,7 @@ def test_who_stands_on_stairs_is_not_fitted() -> None:
         np.testing.assert_allclose(found.misfit, 0.01 * np.sqrt(3), atol=1e-5)
 
 
-def test_each_body_of_a_stream_is_fitted_to_the_points_of_its_own_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_body_of_a_stream_is_fitted_to_the_points_of_its_own_frames(tmp_path: Path, monkeypatch) -> None:
     given: list[tuple[Any, ...]] = []
     monkeypatch.setattr(bodies, "fit_body", lambda *arguments: given.append(arguments) or len(given))
     told: list[tuple[str, Message]] = [*messages(still(20))]

@@ -1,5 +1,3 @@
-"""What each term of the energy is worth, in closed form: nats of motions whose residuals are known by hand."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast

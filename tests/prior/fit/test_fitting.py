@@ -1,5 +1,3 @@
-"""Fits of simulated people, with the weights that ship."""
-
 from pathlib import Path
 
 import numpy as np

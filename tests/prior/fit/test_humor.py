@@ -1,5 +1,3 @@
-"""HuMoR's transition model: frames, steps and rollouts against plain references, training, and what ships."""
-
 from dataclasses import fields
 
 import numpy as np

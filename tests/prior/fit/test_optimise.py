@@ -1,5 +1,3 @@
-"""The search through HM-VAE (section 4): it finds what fits, keeps it, and changes no model."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Fits to key points of an image: where they start, what they are to meet, and what is written of them."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Rotations, kinematics and motions with gradients, against those without."""
-
 from dataclasses import replace
 
 import numpy as np

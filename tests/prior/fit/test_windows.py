@@ -1,5 +1,3 @@
-"""Windows of a long track: how they are joined, told apart and read; what of a body and its messages is fitted."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -166,7 +164,6 @@ def test_smoothness_yields_to_what_a_joint_does_and_not_to_a_jump() -> None:
 
 
 def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its bones and its floor, and from the start that fitted it best."""
     monkeypatch.setattr(windows, "FRAMES", 8)
     monkeypatch.setattr(windows, "OVERLAP", 2)
     given: list[tuple[Start, Any, Any, int]] = []

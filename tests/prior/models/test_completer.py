@@ -1,5 +1,3 @@
-"""The completer: the line that it corrects, both of its forms, and its training."""
-
 from pathlib import Path
 
 import numpy as np

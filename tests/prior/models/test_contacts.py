@@ -1,5 +1,3 @@
-"""The contact network: what it reads, that its live form says the same, and what the shipped weights are worth."""
-
 from functools import lru_cache
 
 import numpy as np

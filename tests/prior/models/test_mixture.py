@@ -1,5 +1,3 @@
-"""The mixture: the live form against torch, and what must hold of its answers."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Occluded joints: what is said of them against naive references, and the network that weighs it against torch."""
-
 import numpy as np
 import pytest
 import torch
@@ -132,7 +130,6 @@ LEG = [J[f"left_{name}"] for name in ("knee", "ankle", "foot")]
 def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_goes_with_the_body(
     limb: list[int], share: float
 ) -> None:
-    """Completion and standing body count the same; an arm is also half the expectation of the observed joints."""
     truth, rng, joints = walking(), np.random.default_rng(0), OccludedJoints("default", 1)
     joints.weigher, posture = (asked := Asked()), LivePosture.load("default")
     unseen, sigma, off = np.zeros((1, 22)), np.full((1, 22), 0.005), []

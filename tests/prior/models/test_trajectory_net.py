@@ -1,5 +1,3 @@
-"""The trajectory network's live form predicts what was trained, frame by frame."""
-
 import numpy as np
 import torch
 

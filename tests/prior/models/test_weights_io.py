@@ -1,5 +1,3 @@
-"""Weights are refused by what is wrong with the file, not by where a network first stumbles."""
-
 import hashlib
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Whiteness of noise is read from bones, so that it is that of the sensor and not of the motion."""
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,5 +1,3 @@
-"""The simulated camera: who is hidden, who is in view, and where the joints are said to be."""
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,5 +1,3 @@
-"""Scripted motions: feet that stay, bones that keep their lengths, a plausible gait."""
-
 from functools import cache
 
 import numpy as np

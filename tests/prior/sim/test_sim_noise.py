@@ -1,5 +1,3 @@
-"""The noise model: what its parameters promise, and that it is like the Kinect it was fitted to."""
-
 import json
 from dataclasses import replace
 from pathlib import Path

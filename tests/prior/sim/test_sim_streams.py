@@ -1,5 +1,3 @@
-"""The manifest, and the recordings made from it."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Bodies as they are published: legs on their bones, the rotations that go with them, deviations and tracking."""
-
 from typing import Any
 
 import numpy as np
@@ -128,7 +126,6 @@ def test_joints_are_published_where_and_as_surely_as_root_and_feet_are_estimated
 
 
 def test_of_a_guessed_leg_no_contact_is_published_and_its_foot_is_as_uncertain_as_it_was_said_to_be() -> None:
-    """Of the left leg only, and whichever of the two deviations of its heel is larger."""
     said = np.full(22, 0.01)
     said[[J["left_ankle"], J["right_ankle"]]] = 0.14
     guessed = (False, False, True, False, True, False)

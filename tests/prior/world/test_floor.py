@@ -1,5 +1,3 @@
-"""The floor found from standing feet."""
-
 from types import SimpleNamespace
 from typing import Any
 

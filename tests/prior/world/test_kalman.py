@@ -1,5 +1,3 @@
-"""The body filter against a textbook Kalman filter, and what feet at rest do to it."""
-
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Which joints of legs are only guesses, by how long they have been unobserved."""
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,7 +37,6 @@ def test_what_was_never_observed_is_a_guess_from_the_first_frame() -> None:
 
 @pytest.mark.parametrize("part", ["ankle", "foot"])
 def test_an_ankle_or_toes_are_a_foot_with_its_knee_and_a_knee_is_none(part: str) -> None:
-    """A foot is that of its own side only."""
     for side in ("left", "right"):
         assert guessed(LegMemory(), f"{side}_{part}") == {name for name in LEGS if not name.startswith(side)}
     assert guessed(LegMemory(), "right_knee") == LEGS - {"right_knee"}

@@ -1,5 +1,3 @@
-"""Bodies as observed in the world, and what the networks read and say of them."""
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,5 +1,3 @@
-"""Sitting, lying and climbing: no ground where there is none, and nobody is worse off for a floor that is known."""
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,3 @@
-"""Which observations and predictions the filter of root and feet uses, and how much it trusts each."""
-
 from copy import deepcopy
 from typing import Any, cast
 

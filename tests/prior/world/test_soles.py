@@ -1,5 +1,3 @@
-"""What a floor says of the heights of feet, against integrals over all heights, and where it must say nothing."""
-
 from typing import Any, cast
 
 import numpy as np

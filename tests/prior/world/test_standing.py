@@ -1,5 +1,3 @@
-"""Feet that stand are published still, and never far from where they are estimated; a root that sways, slowly."""
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

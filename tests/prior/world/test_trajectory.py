@@ -1,5 +1,3 @@
-"""The trajectory pipeline with the weights that ship, on motion made here: no recording goes in."""
-
 from dataclasses import replace
 from functools import lru_cache
 
@@ -108,7 +106,6 @@ def test_turning_the_world_turns_the_answer():
 
 
 def test_camera_that_looks_level_gives_the_same_world():
-    """A frame with -y up is turned to z up."""
     pose = Pose.from_up("-y")
     inverse = Rotation.from_quat(pose.orientation).inv()
 
@@ -222,7 +219,6 @@ def test_sources_are_forgotten_beyond_a_limit_the_longest_unheard_first():
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_nothing_of_a_body_is_left_in_the_one_that_has_its_id_next(seed: int):
-    """Whatever was observed before the timeout; all but the floor, which bodies share."""
     rng, pipeline = np.random.default_rng(seed), TrajectoryPipeline(TrajectorySettings())
     for t in range(12):
         body = stream()[t].bodies[0]

@@ -1,5 +1,3 @@
-"""Damaged motion capture: the reader says so in its own words, and the other recordings are prepared."""
-
 import contextlib
 import io
 import re

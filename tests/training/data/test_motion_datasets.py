@@ -1,5 +1,3 @@
-"""From files to clips: archives and folders, families of skeletons, and the splits."""
-
 import io
 import tarfile
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Files of motion of other kinds than BVH: points by their names, TRC, C3D, arrays; and from any folder."""
-
 import io
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Joint centres from markers put on a body whose joints are known."""
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

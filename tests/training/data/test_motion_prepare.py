@@ -1,5 +1,3 @@
-"""Preparation: resampling, gaps, the floor, what is refused, and the file that comes out."""
-
 import json
 import time
 from dataclasses import replace
@@ -168,9 +166,7 @@ def test_what_is_too_short_is_dropped_in_words(frames: int) -> None:
     assert dropped.kind == "shorter than 1 s"
 
 
-def test_the_command_prepares_what_it_finds_and_lists_what_it_leaves_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prepares_what_it_finds_and_lists_what_it_leaves_out(tmp_path: Path, capsys) -> None:
     mocap = tmp_path / "mocap"
     mocap.mkdir()
     takes = {"001": idle_bvh(72), "014": idle_bvh(72), "002": idle_bvh(12), "003": idle_bvh(72)[:-200]}

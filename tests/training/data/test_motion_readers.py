@@ -1,5 +1,3 @@
-"""Readers of motion capture against kinematics written out by hand, joint by joint and frame by frame."""
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,5 +1,3 @@
-"""UI-PRMD's archive: units, axes, order, and what is missing."""
-
 from pathlib import Path
 
 import numpy as np
