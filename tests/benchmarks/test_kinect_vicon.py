@@ -168,12 +168,6 @@ def test_a_search_has_each_persons_figures_and_their_mean(monkeypatch: pytest.Mo
         assert found[name] == pytest.approx(np.mean(each), abs=1e-3)
 
 
-def test_a_network_answers_at_the_delay_that_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kinect_methods.smoothnet, "smooth", lambda net, seen, delays: [seen + net * d for d in delays])
-    found = kinect_methods._by_network(np.ones((3, 1, 13, 3)), np.arange(3.0), cast(Any, 2.0), 4)
-    np.testing.assert_array_equal(found, np.full((3, 1, 13, 3), 9.0))
-
-
 def test_what_is_the_same_for_all_is_run_once_and_each_clip_gets_its_own() -> None:
     clips = [clip(n, 12)._replace(name=f"{n}") for n in range(3)]
     kinect, asked = Kinect(cast(Bench, None), Path("nowhere.npz"), clips, clips), []

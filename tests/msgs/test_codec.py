@@ -62,7 +62,8 @@ def test_mutated_messages_are_refused_or_read(data: st.DataObject, topic: str):
         at = data.draw(st.integers(0, len(payload) - 1))
         new = data.draw(st.binary(min_size=1, max_size=8))
         payload[at : at + (len(new) if data.draw(st.booleans()) else 0)] = new
-    _decode_or_refuse(topic, bytes(payload))
+    with contextlib.suppress(DecodeError):
+        assert type(decode(topic, bytes(payload))) is TOPICS[topic]
 
 
 @pytest.mark.parametrize("topic", TOPICS)
@@ -128,11 +129,6 @@ def test_a_diagnostic_array_of_two_is_refused():
 def test_an_unknown_topic_is_refused():
     with pytest.raises(DecodeError, match="unknown topic 'pose/row': expected one of pose/raw"):
         decode("pose/row", PAYLOADS[POSE_RAW])
-
-
-def _decode_or_refuse(topic: str, payload: bytes) -> None:
-    with contextlib.suppress(DecodeError):
-        assert type(decode(topic, payload)) is TOPICS[topic]
 
 
 @pytest.mark.parametrize("topic", TOPICS)

@@ -8,6 +8,7 @@ from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -460,7 +461,8 @@ def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_i
         flush = writer._part._writer.flush
         for index, (topic, stamp_ns, message) in enumerate(everything):
             if index == 100:
-                monkeypatch.setattr(writer._part._writer, "flush", lambda: _no_space())
+                full_disk = Mock(side_effect=OSError(28, "No space left on device"))
+                monkeypatch.setattr(writer._part._writer, "flush", full_disk)
             try:
                 writer.write(topic, message, stamp_ns)
             except OSError:
@@ -470,7 +472,3 @@ def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_i
     found = read(directory)
     assert len(found) > len(everything) - 60
     assert found[-1].stamp_ns == max(recorded.stamp_ns for recorded in everything)
-
-
-def _no_space() -> None:
-    raise OSError(28, "No space left on device")

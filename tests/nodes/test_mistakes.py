@@ -46,150 +46,126 @@ def frame_by_frame(joints: np.ndarray, times: np.ndarray) -> None:
     cleaner.flush()
 
 
+Filter: Any = steadypose.Filter
+clean: Any = steadypose.clean
+plot: Any = steadypose.plot
 REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "coordinates before joints": (
-        lambda j: steadypose.clean(j.transpose(0, 2, 1), fps=30),
+        lambda j: clean(j.transpose(0, 2, 1), fps=30),
         r"last two axes are exchanged: positions\.transpose\(0, 2, 1\)",
     ),
     "a row of numbers a frame": (
-        lambda j: steadypose.clean(j.reshape(FRAMES, -1), fps=30),
+        lambda j: clean(j.reshape(FRAMES, -1), fps=30),
         r"positions\.reshape\(len\(positions\), 22, 3\)",
     ),
-    "a single frame": (lambda j: steadypose.clean(j[0], fps=30), r"positions\[None\], or steadypose\.Filter"),
+    "a single frame": (lambda j: clean(j[0], fps=30), r"positions\[None\], or steadypose\.Filter"),
     "bodies before time": (
-        lambda j: steadypose.clean(np.stack([j, j]).transpose(1, 2, 0, 3), fps=30),
+        lambda j: clean(np.stack([j, j]).transpose(1, 2, 0, 3), fps=30),
         r"bodies come after time: positions\.transpose\(0, 2, 1, 3\)",
     ),
     "a confidence as the fourth number": (
-        lambda j: steadypose.clean(np.dstack([j, np.ones((FRAMES, 22))]), fps=30),
+        lambda j: clean(np.dstack([j, np.ones((FRAMES, 22))]), fps=30),
         r"positions\[\.\.\., :3\], confidence=positions\[\.\.\., 3\]",
     ),
-    "pixels": (lambda j: steadypose.clean(j[..., :2], fps=30), "key points of an image: steadypose fit lifts them"),
+    "pixels": (lambda j: clean(j[..., :2], fps=30), "key points of an image: steadypose fit lifts them"),
     "33 joints without a skeleton": (
-        lambda j: steadypose.clean(np.zeros((FRAMES, 33, 3)), fps=30),
+        lambda j: clean(np.zeros((FRAMES, 33, 3)), fps=30),
         "33 joints: skeleton 'blazepose33'",
     ),
-    "a skeleton by another name": (
-        lambda j: steadypose.clean(j[:, :17], fps=30, skeleton="COCO_17"),
-        "did you mean 'coco17'",
-    ),
-    "a skeleton by its tracker's name": (lambda j: steadypose.Filter("MediaPipe"), "did you mean 'blazepose33'"),
-    "no skeleton": (lambda j: steadypose.Filter(None), "name of a layout, or its joints, got None"),  # type: ignore[arg-type]
-    "a skeleton that nobody knows": (lambda j: steadypose.Filter(skeleton="thing"), "expected one of smpl22, coco17"),
-    "no rate": (lambda j: steadypose.clean(j), "of a regular stream give fps, 30 for instance"),
+    "a skeleton by another name": (lambda j: clean(j[:, :17], fps=30, skeleton="COCO_17"), "did you mean 'coco17'"),
+    "a skeleton by its tracker's name": (lambda j: Filter("MediaPipe"), "did you mean 'blazepose33'"),
+    "no skeleton": (lambda j: Filter(None), "name of a layout, or its joints, got None"),
+    "a skeleton that nobody knows": (lambda j: Filter(skeleton="thing"), "expected one of smpl22, coco17"),
+    "no rate": (lambda j: clean(j), "of a regular stream give fps, 30 for instance"),
     "stamps in seconds": (
-        lambda j: steadypose.clean(j, stamp_ns=seconds()),
+        lambda j: clean(j, stamp_ns=seconds()),
         r"these seem to be seconds: np\.round\(stamps \* 1e\+09\)",
     ),
     "stamps in milliseconds, as floats": (
-        lambda j: steadypose.clean(j, stamp_ns=seconds() * 1e3),
+        lambda j: clean(j, stamp_ns=seconds() * 1e3),
         r"these seem to be milliseconds: np\.round\(stamps \* 1e\+06\)",
     ),
     "a stamp too many": (
-        lambda j: steadypose.clean(j, stamp_ns=np.arange(FRAMES + 1) * 33_333_333),
+        lambda j: clean(j, stamp_ns=np.arange(FRAMES + 1) * 33_333_333),
         "one stamp a frame: 50 frames, 51 stamps",
     ),
-    "an axis that is none": (lambda j: steadypose.clean(j, fps=30, up="Y"), "expected one of 'z', 'y', '-y', got 'Y'"),
+    "an axis that is none": (lambda j: clean(j, fps=30, up="Y"), "expected one of 'z', 'y', '-y', got 'Y'"),
     "frames of different length": (
-        lambda j: steadypose.clean([frame[: 20 + k % 2].tolist() for k, frame in enumerate(j)], fps=30),
+        lambda j: clean([frame[: 20 + k % 2].tolist() for k, frame in enumerate(j)], fps=30),
         "have NaN there, not fewer entries",
     ),
-    "None for a missing joint": (lambda j: steadypose.clean(with_none(j), fps=30), "NaN"),
-    "a file that does not exist": (lambda j: steadypose.clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
-    "a file that does not exist, and its rate": (
-        lambda j: steadypose.clean("hello", fps=30),
-        r"hello does not exist: expected",
-    ),
+    "None for a missing joint": (lambda j: clean(with_none(j), fps=30), "NaN"),
+    "a file that does not exist": (lambda j: clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
+    "a file that does not exist, and its rate": (lambda j: clean("hello", fps=30), r"hello does not exist: expected"),
     "a setting that there is not": (
-        lambda j: steadypose.clean(j, fps=30, settings={"prior": {"delya": 2}}),
+        lambda j: clean(j, fps=30, settings={"prior": {"delya": 2}}),
         "has no setting 'delya', did you mean 'delay'",
     ),
     "a section that there is not": (
-        lambda j: steadypose.Filter(settings={"prior.delay": 2}),  # type: ignore[arg-type]
+        lambda j: Filter(settings={"prior.delay": 2}),
         r"expected sections 'prior', 'trajectory', 'events'.*got 'prior\.delay', did you mean 'prior'",
     ),
-    "a rate and stamps": (
-        lambda j: steadypose.clean(j, fps=30, stamp_ns=TICKS),
-        "or stamp_ns, got both; leave fps out",
-    ),
+    "a rate and stamps": (lambda j: clean(j, fps=30, stamp_ns=TICKS), "or stamp_ns, got both; leave fps out"),
     "a rate beside arrays with stamps": (
-        lambda j: steadypose.clean({"positions": j, "skeleton": "smpl22", "stamp_ns": TICKS}, fps=60),
+        lambda j: clean({"positions": j, "skeleton": "smpl22", "stamp_ns": TICKS}, fps=60),
         "or stamp_ns, got both; leave fps out",
     ),
-    "joints under another name": (lambda j: steadypose.clean({"joints": j}, fps=30), "expected an array 'positions'"),
-    "joints to draw that are not clean": (lambda j: steadypose.plot(j), r"steadypose\.plot\(steadypose\.clean"),  # type: ignore[arg-type]
-    "a delay of seconds": (
-        lambda j: steadypose.clean(j, fps=30, delay=0.1),  # type: ignore[arg-type]
-        "expected int such as 4, got 0.1",
-    ),
-    "a frame without its time": (lambda j: steadypose.Filter()(j[0]), "t in seconds or as stamp_ns, got neither"),
-    "two times of a frame": (
-        lambda j: steadypose.Filter()(j[0], 0.0, stamp_ns=0),
-        "t in seconds or as stamp_ns, got both",
-    ),
-    "nanoseconds as seconds": (lambda j: steadypose.Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
+    "joints under another name": (lambda j: clean({"joints": j}, fps=30), "expected an array 'positions'"),
+    "joints to draw that are not clean": (lambda j: plot(j), r"steadypose\.plot\(steadypose\.clean"),
+    "a delay of seconds": (lambda j: clean(j, fps=30, delay=0.1), "expected int such as 4, got 0.1"),
+    "a frame without its time": (lambda j: Filter()(j[0]), "t in seconds or as stamp_ns, got neither"),
+    "two times of a frame": (lambda j: Filter()(j[0], 0.0, stamp_ns=0), "t in seconds or as stamp_ns, got both"),
+    "nanoseconds as seconds": (lambda j: Filter()(j[0], 1.7e18), "say stamp_ns= of nanoseconds"),
     "many frames at once": (
-        lambda j: steadypose.Filter()(np.concatenate([j, j, j]), 0.0),
+        lambda j: Filter()(np.concatenate([j, j, j]), 0.0),
         r"got 150; frames go one by one, and a whole recording into steadypose\.clean",
     ),
-    "seconds as text": (
-        lambda j: steadypose.Filter()(j[0], "0.1"),  # type: ignore[arg-type]
-        "t: expected seconds of 0 or more, got '0.1'",
-    ),
+    "seconds as text": (lambda j: Filter()(j[0], "0.1"), "t: expected seconds of 0 or more, got '0.1'"),
     "seconds as nanoseconds": (
-        lambda j: steadypose.Filter()(j[0], stamp_ns=1.7e9 + 0.3),  # type: ignore[arg-type]
+        lambda j: Filter()(j[0], stamp_ns=1.7e9 + 0.3),
         "stamp_ns: expected whole nanoseconds, got 1700000000.3; seconds are t",
     ),
     "names for ids": (
-        lambda j: steadypose.Filter()(j[:1], 0.1, ids=["anna"]),  # type: ignore[list-item]
+        lambda j: Filter()(j[:1], 0.1, ids=["anna"]),
         "ids: expected a list of 1 different integers of 32 bits, one a body, got .'anna'.",
     ),
-    "an id that is not in a list": (
-        lambda j: steadypose.Filter()(j[0], 0.1, ids=3),  # type: ignore[arg-type]
-        "one a body, got 3",
-    ),
-    "an id of 64 bits": (lambda j: steadypose.Filter()(j[0], 0.1, ids=[2**31]), r"of 32 bits, .*got .2147483648."),
+    "an id that is not in a list": (lambda j: Filter()(j[0], 0.1, ids=3), "one a body, got 3"),
+    "an id of 64 bits": (lambda j: Filter()(j[0], 0.1, ids=[2**31]), r"of 32 bits, .*got .2147483648."),
     "confidence in words": (
-        lambda j: steadypose.Filter()(j[0], 0.1, confidence=["high"] * 22),  # type: ignore[list-item]
+        lambda j: Filter()(j[0], 0.1, confidence=["high"] * 22),
         r"confidence: expected \(1, 22\) numbers of 0 to 1, got <U4 of shape \(22,\)",
     ),
-    "a place for a pose": (
-        lambda j: steadypose.Filter(sensor_pose=(0.0, 0.0, 1.4)),  # type: ignore[arg-type]
-        r"sensor_pose: expected steadypose\.Pose",
-    ),
+    "a place for a pose": (lambda j: Filter(sensor_pose=(0.0, 0.0, 1.4)), r"sensor_pose: expected steadypose\.Pose"),
     "a section that is a number": (
-        lambda j: steadypose.clean(j, fps=30, settings={"prior": 2}),  # type: ignore[dict-item]
+        lambda j: clean(j, fps=30, settings={"prior": 2}),
         r"each with its settings, such as .*; got prior = 2",
     ),
     "an event's threshold that there is not": (
-        lambda j: steadypose.clean(j, fps=30, settings={"events": {"neer": 2.0}}),
+        lambda j: clean(j, fps=30, settings={"events": {"neer": 2.0}}),
         r"\[events\] has no setting 'neer', did you mean 'near'",
     ),
-    "all frames at once": (lambda j: steadypose.Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
+    "all frames at once": (lambda j: Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
 }
 
 WARNED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
-    "millimetres": (lambda j: steadypose.clean(1000 * j, fps=30), "millimetres, expected metres; divide by 1000"),
+    "millimetres": (lambda j: clean(1000 * j, fps=30), "millimetres, expected metres; divide by 1000"),
     "milliseconds, frame by frame": (
         lambda j: frame_by_frame(j, 1e3 * seconds()),
         "they seem to be milliseconds, converted as if they were seconds",
     ),
-    "shorter than the delay": (
-        lambda j: steadypose.clean(j[:4], fps=30),
-        "lasts 0.10 s, less than the delay of 4 frames",
-    ),
+    "shorter than the delay": (lambda j: clean(j[:4], fps=30), "lasts 0.10 s, less than the delay of 4 frames"),
     "coordinates of a map, frame by frame": (
         lambda j: frame_by_frame(j + [35.0, 0.0, 0.0], seconds()),
         "expected at most 30 m",
     ),
     "a clock that is set back": (
-        lambda j: steadypose.clean(j, stamp_ns=np.where(np.arange(FRAMES) < 20, 500, 0) * 10**9 + TICKS),
+        lambda j: clean(j, stamp_ns=np.where(np.arange(FRAMES) < 20, 500, 0) * 10**9 + TICKS),
         "stamps go back by 500.0 s",
     ),
-    "nobody": (lambda j: steadypose.clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "nobody: no frame has a body"),
+    "nobody": (lambda j: clean(np.full((FRAMES, 2, 22, 3), np.nan), fps=30), "nobody: no frame has a body"),
     "nobody, frame by frame": (lambda j: frame_by_frame(np.empty((9, 0, 22, 3)), seconds()[:9]), "^nobody: "),
     "bodies of two joints": (
-        lambda j: steadypose.clean(np.where(np.arange(22)[:, None] < 2, j, np.nan), fps=30),
+        lambda j: clean(np.where(np.arange(22)[:, None] < 2, j, np.nan), fps=30),
         "nobody_recognised: no body in any frame gave a pose",
     ),
 }

@@ -3,6 +3,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -127,10 +128,8 @@ def test_an_output_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     clean_recording(source, tmp_path / "out", DEFAULT)
     before = names(tmp_path)
 
-    def fail(*_: object) -> None:
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr("steadypose.nodes.commands.output.RecordingWriter.write", fail)
+    full_disk = Mock(side_effect=OSError("no space left on device"))
+    monkeypatch.setattr("steadypose.nodes.commands.output.RecordingWriter.write", full_disk)
     with pytest.raises(OSError, match="no space"):
         clean_recording(source, tmp_path / "out", DEFAULT, replace=True)
     with pytest.raises(LaunchError, match="or --force to replace it"):

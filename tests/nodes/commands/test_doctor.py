@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace as Made
+from unittest.mock import Mock
 
 import pytest
 
@@ -88,8 +89,7 @@ def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for version, expected in (((3, 10, 0), Verdict.GOOD), ((3, 13, 1), Verdict.GOOD), ((3, 14, 0), Verdict.BAD)):
         monkeypatch.setattr(command.sys, "version_info", version)
         finding = only(command.check_python)
-        assert finding.verdict is expected
-        assert finding.found == ".".join(map(str, version))
+        assert (finding.verdict, finding.found) == (expected, ".".join(map(str, version)))
 
 
 def test_a_busy_processor_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,9 +138,7 @@ def test_the_prior_is_timed_on_a_body_that_stands(monkeypatch: pytest.MonkeyPatc
 
 
 def test_missing_streams_say_what_to_play_instead(monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(path: Path) -> None:
-        raise LaunchError(f"{path} does not exist")
-
+    gone = Mock(side_effect=LaunchError("it does not exist"))
     monkeypatch.setattr("steadypose.nodes.sources.recording.open_recording", gone)
     finding = only(checks.check_streams)
     assert finding.verdict is Verdict.BAD

@@ -3,6 +3,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from conftest import VirtualClock, walk
@@ -50,10 +51,8 @@ def test_a_disk_that_is_full_before_it_was_noticed(
     for frame in frames[:60]:
         node.handle(POSE_RAW, frame)
 
-    def fail() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(node._writer._part._writer, "flush", fail)
+    full_disk = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(node._writer._part._writer, "flush", full_disk)
     for frame in frames[60:]:
         node.handle(POSE_RAW, frame)
     node._writer.close()

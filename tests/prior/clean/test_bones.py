@@ -7,6 +7,7 @@ from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.clean.bones import MIN_FRAMES, UNKNOWN_VARIANCE, BiasEstimator, PersonEstimator, SensorBias
 from steadypose.prior.clean.frame import Person
 from steadypose.prior.clean.settings import PersonSettings
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.kalman import Smoothed
 
 BONES = Person.generic(1)
@@ -29,12 +30,8 @@ def test_a_perfect_sensor_has_none() -> None:
 
 @pytest.mark.parametrize("bias", [0.01, 0.02])
 def test_an_error_that_lasts_is_found_from_bones(bias: float) -> None:
-    rng = np.random.default_rng(0)
-    error, seen = np.zeros((22, 3)), []
-    for frame in waving(240):
-        error = 0.95 * error + np.sqrt(1 - 0.95**2) * bias * rng.standard_normal((22, 3))
-        seen.append(frame + error)
-    assert found(np.array(seen), sigma=0.002, jitter=0.004).bias_sigma[0] == pytest.approx(bias, rel=0.35)
+    seen = waving(240) + time_correlated(bias * np.random.default_rng(0).standard_normal((240, 22, 3)), 0.95)
+    assert found(seen, sigma=0.002, jitter=0.004).bias_sigma[0] == pytest.approx(bias, rel=0.35)
 
 
 def test_noise_that_the_smoother_states_is_none() -> None:

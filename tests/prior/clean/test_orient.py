@@ -9,6 +9,7 @@ from steadypose.prior.body.kinematics import global_rotations, heading, rotation
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.sim.noise import time_correlated
 
 FRAMES, SETTLED = 45, 20
 
@@ -48,10 +49,7 @@ def test_on_a_perfect_input_bones_lie_as_the_joints_and_the_heading_stays() -> N
 
 def test_with_noise_the_root_is_nearer_the_true_one_and_turns_less() -> None:
     truth = waving(FRAMES)
-    rng, noise = np.random.default_rng(0), np.zeros((FRAMES, 22, 3))
-    noise[0] = rng.normal(0.0, 0.02, (22, 3))
-    for t in range(1, FRAMES):
-        noise[t] = 0.93 * noise[t - 1] + rng.normal(0.0, 0.02 * np.sqrt(1 - 0.93**2), (22, 3))
+    noise = time_correlated(np.random.default_rng(0).normal(0.0, 0.02, (FRAMES, 22, 3)), 0.93)
     true = Rotation.from_matrix(solve_rotations(truth, REST_OFFSETS)[SETTLED:, 0])
     mine, plain = (_root(_bodies(truth + noise, on)) for on in (True, False))
     assert np.median((mine.inv() * true).magnitude()) < 0.7 * np.median((plain.inv() * true).magnitude())

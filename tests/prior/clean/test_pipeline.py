@@ -311,13 +311,6 @@ def test_end_of_stream_flushes_and_is_passed_on() -> None:
     assert pipeline.flush() == []
 
 
-@pytest.mark.parametrize(("stage", "enabled"), [("gate", False), ("person", False), ("refine", True), ("fuse", False)])
-def test_each_stage_can_be_switched(stage: str, enabled: bool) -> None:
-    cleaned, _ = clean(stream(noisy(15, 0.02)), **{stage: {"enabled": enabled}})
-    assert np.isfinite(positions(cleaned)).all()
-    assert len(cleaned) == 15
-
-
 def test_settings_are_read_strictly() -> None:
     assert PriorSettings.from_dict({"delay": 2, "gate": {"jump": 1}}).gate.jump == 1.0
     with pytest.raises(ValueError, match="did you mean 'delay'"):

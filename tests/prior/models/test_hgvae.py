@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tests.helpers.bodies import waving
 from tests.prior.models.test_hmvae import prepared
 
+from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
@@ -68,8 +69,7 @@ def test_a_node_is_one_coordinate_of_one_joint_through_all_frames() -> None:
 def test_tracks_do_not_depend_on_where_a_body_is_or_faces(turn, east, north, size, hidden, seed) -> None:
     window = waving(20)
     window[5:15, list(hidden)] = np.nan
-    c, s = np.cos(turn), np.sin(turn)
-    moved = size * window @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [east, north, 0.3]
+    moved = size * window @ yaw_matrix(turn).T + [east, north, 0.3]
     here, there = to_tracks(window, 1.0), to_tracks(moved, size)
     np.testing.assert_allclose(there.x, here.x, atol=1e-9)
     np.testing.assert_array_equal(there.observed, np.repeat(np.isfinite(window[..., 0]).T, 3, axis=0))

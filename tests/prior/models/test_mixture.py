@@ -7,6 +7,7 @@ from safetensors.torch import save_file
 
 from steadypose.benchmarks.baselines.kalman import fixed_lag
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
@@ -186,8 +187,7 @@ def test_a_perfect_input_stays_what_it_is(delay: int, pace: float) -> None:
 @pytest.mark.parametrize("delay", [0, 4])
 def test_place_and_heading_of_the_body_change_nothing(delay: int) -> None:
     seen = noisy(walk())
-    angle = 1.1
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    turn = yaw_matrix(1.1)
     moved = seen @ turn.T + (3.0, -2.0, 0.4)
     there = places(smoothed(seen, delay)) @ turn.T + (3.0, -2.0, 0.4)
     np.testing.assert_allclose(places(smoothed(moved, delay)), there, atol=2e-4)

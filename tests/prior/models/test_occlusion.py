@@ -34,10 +34,7 @@ class Asked:
 def walking(bodies: int = 1) -> Floats:
     """(T, B, 22, 3) metres: bodies that wave, turn and go."""
     motion = np.stack([waving(FRAMES + 9 * body)[9 * body :] for body in range(bodies)], axis=1)
-    angle = np.linspace(0.0, 1.2, FRAMES)[:, None]
-    turned = motion.copy()
-    turned[..., 0] = np.cos(angle)[..., None] * motion[..., 0] - np.sin(angle)[..., None] * motion[..., 1]
-    turned[..., 1] = np.sin(angle)[..., None] * motion[..., 0] + np.cos(angle)[..., None] * motion[..., 1]
+    turned = motion @ yaw_matrix(np.linspace(0.0, 1.2, FRAMES))[:, None].swapaxes(-1, -2)
     return turned + np.linspace(0.0, 1.0, FRAMES)[:, None, None, None] * (1.0, 0.4, 0.0)
 
 
@@ -110,8 +107,7 @@ def test_joints_keep_their_place_beside_the_body(seed: int) -> None:
 
 def test_place_and_heading_of_the_body_change_no_feature() -> None:
     truth, hidden = walking(), occlusions(1, 0)
-    angle = 2.0
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    turn = yaw_matrix(2.0)
     there = asked_of(truth @ turn.T + (3.0, -2.0, 0.5), hidden)
     for a, b in zip(asked_of(truth, hidden), there, strict=True):
         np.testing.assert_allclose(a.features, b.features, atol=2e-4)

@@ -4,15 +4,14 @@ from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 
 from steadypose.prior.models.mixture.whiteness import LARGE, LARGE_NEWEST, SHARE, Whiteness, fallback
+from steadypose.prior.sim.noise import time_correlated
 
 FRAMES, SIGMA = 90, 0.01
 
 
 def lasting(shape: tuple[int, ...], seconds: float) -> NDArray[np.float64]:
-    noise, kept = np.random.default_rng(0).standard_normal(shape), np.exp(-1 / (30 * seconds)) if seconds else 0.0
-    for t in range(1, len(noise)):
-        noise[t] = kept * noise[t - 1] + np.sqrt(1 - kept**2) * noise[t]
-    return SIGMA * noise
+    kept = np.exp(-1 / (30 * seconds)) if seconds else 0.0
+    return SIGMA * time_correlated(np.random.default_rng(0).standard_normal(shape), kept)
 
 
 def whiteness_of(positions: NDArray[np.float64], delay: int = 4) -> float:

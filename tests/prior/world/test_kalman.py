@@ -14,10 +14,6 @@ DT = 1 / 30
 RESTS, SWINGS = np.ones(1), np.zeros(1)
 
 
-def at_origin(noise: BodyNoise, jitter: float, bias: float = 0.0) -> BodyFilter:
-    return BodyFilter(noise, np.zeros(3), jitter, bias, np.zeros(3), feet=1)
-
-
 def spring(rate: float, dt: float) -> NDArray[np.float64]:
     """Of an error and its rate in units of ``rate``: x'' = -2 w x' - w² x."""
     return np.asarray(expm(rate * dt * np.array([[0.0, 1.0], [-1.0, -2.0]])), dtype=np.float64)
