@@ -141,14 +141,18 @@ def _paths(messages: Sequence[PoseRaw]) -> list[tuple[NDArray[np.int64], Floats]
 
 
 def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
-    flat = np.nanmax(joints, axis=(0, 1)) - np.nanmin(joints, axis=(0, 1))
-    if (flat == 0).all():
+    several = joints[np.isfinite(joints[..., 0]).sum(axis=1) > 1]  # a single joint is a point in any case
+    if not len(several):
+        return None
+    flat = np.nanmax(several, axis=1) == np.nanmin(several, axis=1)
+    if 2 * (points := flat.all(axis=1)).sum() >= len(several):
         return error(
             "one_point",
-            f"all joints are at {joints[0, 0].tolist()}: expected metres, and NaN of a joint that was not seen",
+            f"all joints of a body are at one point, {np.nanmax(several[points][-1], axis=0).round(3).tolist()}, in "
+            f"{points.sum()} of the last {len(several)} bodies: expected metres, and NaN of a joint that was not seen",
         )
-    if (flat == 0).any():
-        axis = "xyz"[int(np.argmax(flat == 0))]
+    if flat.all(axis=0).any():
+        axis = "xyz"[int(np.argmax(flat.all(axis=0)))]
         return error(
             "flat",
             f"{axis} is the same for all joints, as in 2D key points without depth: expected three coordinates in "

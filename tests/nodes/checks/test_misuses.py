@@ -108,6 +108,9 @@ FOUR_SEEN = joints(lambda it: np.where(np.arange(22)[:, None] < 4, it, np.nan))
 WITH_ARMS = (np.arange(22) < 18).astype(np.float32)
 WRIST_ZERO = body(lambda it, k: RawBody(it.id, it.positions * (np.arange(22) != 20 - k % 2)[:, None], it.confidence))
 WALL_CLOCK_SET = stamp(lambda ns, index: ns - 3600 * SECOND_NS * (index > 60))
+AT_PELVIS_OR_NOWHERE = body(
+    lambda it, k: RawBody(it.id, it.positions[:1] + np.full((22, 1), np.nan if k % 3 == 0 else 0.0), it.confidence)
+)
 ID_A_FRAME = body(lambda it, index: moved(it, 0.0, index))
 ONE_ID_IN_TURN = body(lambda it, index: moved(it, 1.5 * (index % 2)))
 
@@ -161,6 +164,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "coordinates of a map": (joints(lambda it: it + [35, 0, 0]), "too_far", "subtract an origin"),
     "joints relative to the root": (joints(lambda it: it - it[0]), "root_relative", "add the root's place"),
     "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN of a joint"),
+    "all joints at the pelvis, or missing": (AT_PELVIS_OR_NOWHERE, "one_point", "in 20 of the last 20 bodies"),
     "all joints missing": (joints(lambda it: np.full_like(it, np.nan)), "all_missing", "send no body"),
     "zeros for a joint that is not found": (WRIST_ZERO, "zeros", "NaN, or confidence 0"),
     "hardly a joint seen": (FOUR_SEEN, "few_joints", "the tracker's own threshold"),
