@@ -35,6 +35,9 @@ def evaluate(
     is committed. Others are written to the folder of --out, if any. Every reading of 'test' is logged in
     benchmarks/results/test-readings.csv.
 
+    Try:
+      steadypose evaluate fidelity --quick
+
     Args:
         study: what to measure, or 'all' studies except those of the whole system (latency, scale, restart, soak,
             events, retarget).

@@ -24,8 +24,8 @@ from steadypose.prior.settings import nearest
 
 EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
-    "run": ("run", "start the nodes of a launch file, watch and restart them"),
-    "node": ("node", "run a single node, for another machine or a supervisor"),
+    "run": ("run", "clean poses live, from a camera, a tracker or a recording"),
+    "node": ("node", "run one node of `run`, for another machine or a supervisor"),
     "clean": ("clean", "clean a recording, .npz or .csv offline, as `run` does live"),
     "retarget": ("export", "convert a person's motion to a robot's, by its URDF"),
     "fit": ("fit", "fit a motion to a whole recording; slower than `clean`"),

@@ -294,6 +294,10 @@ def calibrate(
     The steps in order: 'board' writes a board to print, 'lens' uses images of it, and 'pose' uses images of it on the
     floor. With a depth camera, 'floor' can replace 'pose'. Each step writes its result to the launch file, whose
     comments are kept. Separately, 'sensor' trains a correction of a sensor's own error. See docs/calibrate.md.
+
+    Try:
+      steadypose calibrate board board.pdf
+      steadypose calibrate pose --help
     """
     step.run()
 

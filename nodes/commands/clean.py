@@ -49,6 +49,11 @@ def clean(
     joints or rows are wrong, most frames give no pose, or there is nobody) or IN is damaged; of a folder, if this holds
     for a recording, or one cannot be cleaned.
 
+    Try:
+      steadypose clean walk_turn walk.npz             a bundled recording
+      steadypose clean joints.csv clean.csv --delay 8
+      steadypose clean takes/ cleaned/                all in a folder
+
     Args:
         source: a recording; a .csv; an .npz with positions (T, J, 3) in metres, skeleton, and stamp_ns (T,) or fps;
             motion capture (.bvh, .trc, .c3d, AMASS .npz, .npy); a folder of these, with subfolders; or one video.

@@ -35,6 +35,10 @@ if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
 def doctor(live: bool = False, launch: str = "replay") -> int:
     """Check this machine: what works, what is missing, and which command mends it.
 
+    Try:
+      steadypose doctor
+      steadypose doctor --live   while your tracker runs
+
     Args:
         live: listen for three seconds to your tracker and to running nodes, and report problems.
         launch: launch file, or name of a bundled one, whose addresses to listen at.

@@ -29,26 +29,27 @@ def export(
     names: Literal["smpl22", "vrm", "mixamo"] = "smpl22",
     force: bool = False,
 ) -> int:
-    """Write cleaned motion for other programs. The ending of OUT chooses the format.
+    """Write cleaned motion as a file for other programs. The ending of OUT chooses the format.
 
-    The file holds one body, in the world frame (floor at 0 if the sensor's pose is calibrated), at the input's frame
+    The file holds one person, in the world frame (floor at 0 if the sensor's pose is calibrated), at the input's frame
     rate. Bone lengths are constant, the rotations are those of 'clean', and the rest pose is a T-pose.
       .bvh   animation programs: centimetres, y up, facing +z
-      .glb   Blender, Unity, Unreal, browsers: bones with a skin; metres, y up
+      .glb   Blender, Unity, Unreal, browsers: a body with bones; metres, y up
       .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop
       .csv   spreadsheets, and steadypose itself: metres, z up, and quaternions xyzw
       .trc   OpenSim: markers at the joints; millimetres, y up
     .glb and .vrma need the extra 'export'.
 
     Try:
-      steadypose clean take.npz clean.npz && steadypose export clean.npz take.bvh
-      steadypose export my_recording take.glb --body 2
+      steadypose clean walk_turn clean.npz       a bundled recording
+      steadypose export clean.npz walk.bvh
+      steadypose export cleaned walk.glb --body 2   of several people
 
     Args:
-        source: output of 'steadypose clean' or 'run --record': a recording with pose/world, or an .npz.
+        source: what 'steadypose clean' or 'run --record' wrote: a recording with pose/world, or an .npz.
         out: the file to write: .bvh, .glb, .vrma, .csv or .trc.
         names: names of the joints in .bvh and .glb: those of steadypose, VRM or Mixamo.
-        body: id of the body. Default: the one that is visible longest.
+        body: id of the person, as 'steadypose info IN' lists them. Default: the one that is visible longest.
         force: replace OUT if it exists.
     """
     source = located(str(source), Path(), STREAMS)

@@ -52,6 +52,10 @@ def fit(
     surface points of the body from a depth camera, in the same frame.
 
     Also writes OUT.misfit.npz (the residual of each joint and frame, bones and ground) and OUT.fit.png (a plot of it).
+    Needs the extra 'train'.
+
+    Try:
+      steadypose fit walk_turn fitted.npz
 
     Args:
         source: a recording, .csv or .npz, as for `clean`; or an .npz with key points.

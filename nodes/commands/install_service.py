@@ -186,6 +186,10 @@ def install_service(
     sockets and health.json to /run/NAME, and nothing elsewhere. It sees no home folders, and uses no devices but
     cameras.
 
+    Try:
+      steadypose install-service oak --dry-run
+      sudo steadypose install-service /etc/kitchen.toml
+
     Args:
         launch: a launch file, or the name of a bundled one. The file must lie outside home folders, such as in /etc.
         name: name of the service and of its folders.

@@ -17,7 +17,10 @@ from steadypose.prior.settings import nearest
 
 
 def node(arguments: Sequence[str]) -> None:
-    """Run one node of a launch file until SIGTERM or Ctrl-C."""
+    """Run one node of a launch file until SIGTERM or Ctrl-C: `steadypose run` starts each like this.
+
+    Try: steadypose node prior --launch server
+    """
     parser = argparse.ArgumentParser(prog="steadypose node", description=node.__doc__, allow_abbrev=False)
     parser.add_argument("name", help=", ".join(NODES))
     parser.add_argument("--launch", default="replay", help="a launch file, or the name of a bundled one")

@@ -24,6 +24,10 @@ def plot(
 ) -> None:
     """Plot a recording as an image or a video.
 
+    Try:
+      steadypose plot walk_turn
+      steadypose plot cleaned --video walk.gif
+
     Args:
         recording: rosbag2 directory or .mcap with any of pose/raw, pose/clean, pose/world, pose/truth; or a file of
             poses in a format of 'clean'.

@@ -52,9 +52,16 @@ def run(
     view: bool = False,
     settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="SECTION.KEY=VALUE")] = (),
 ) -> int:
-    """Start the nodes of a launch file, and show their state until the stream ends or Ctrl-C.
+    """Clean poses live: start the nodes of a launch file, and show their state until the stream ends or Ctrl-C.
 
-    A node that crashes or hangs is restarted. On a terminal, the 3D view stays open after the stream has ended.
+    The launch file names the source: a camera, a tracker or a recording. The clean poses go to whoever subscribes (try
+    `steadypose echo pose/world`), to the recording and to the 3D view. A node that crashes or hangs is restarted. On a
+    terminal, the 3D view stays open after the stream has ended.
+
+    Try:
+      steadypose run --view                           a bundled recording
+      steadypose run --input take.npz --record take   your own
+      steadypose run oak                              an OAK camera
 
     Args:
         launch: a launch file, or the name of a bundled one, such as replay, oak, ros2 or server.

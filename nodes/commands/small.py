@@ -21,6 +21,9 @@ def keys(directory: Path) -> None:
     subscriber, save own.key of the publisher as server.key. Then set `keys` to this folder, in [transport] of the
     launch file.
 
+    Try:
+      steadypose keys keys
+
     Args:
         directory: folder for the keys. Keep own.key_secret secret.
     """
@@ -41,6 +44,9 @@ def repair(
 
     Use it for damaged files, and for recordings whose writer was killed, which other programs may not read. Each
     damaged place costs half a second at most. The exit status is 1 if anything is lost.
+
+    Try:
+      steadypose repair take take-repaired
 
     Args:
         source: a rosbag2 directory or an .mcap.

@@ -61,6 +61,9 @@ def train(
     To train on several processes or machines, use torchrun:
     `torchrun --nproc-per-node 2 -m steadypose.nodes.cli train hmvae`.
 
+    Try:
+      steadypose prepare mocap/ && steadypose train contacts
+
     Args:
         model: mixture (the smoother), body_modes (which joints it smooths together; takes seconds), hmvae (refinement),
             hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), trajectory (root velocity),

@@ -1,3 +1,4 @@
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,15 @@ def test_help_lists_every_command_and_imports_almost_nothing() -> None:
         assert f"  {name}" in out
         assert what in out
     assert out.endswith("`steadypose help uninstall`.\n"), "and none of those modules"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_s_help_has_an_example(name: str) -> None:
+    place, _ = COMMANDS[name]
+    file = place.removeprefix("steadypose.").replace(".", "/") if "." in place else f"nodes/commands/{place}"
+    written = ast.parse((Path(__file__).parents[3] / f"{file}.py").read_text()).body
+    (command,) = [it for it in written if isinstance(it, ast.FunctionDef) and it.name == name.replace("-", "_")]
+    assert f" steadypose {name}" in (ast.get_docstring(command) or "").partition("Try:")[2]
 
 
 def test_help_explains_upgrading_uninstalling_and_each_command(capsys, monkeypatch) -> None:
