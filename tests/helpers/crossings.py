@@ -4,12 +4,10 @@ The simulated tracker knows who is who, so each observation's person is known. T
 order and without ids.
 """
 
-import dataclasses
 from collections import Counter
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +25,8 @@ HIDDEN_S = 1.0
 """Seconds, the least for which the one who is hidden is not observed."""
 
 
-@dataclass(frozen=True)
-class Frame:
-    """The bodies of a frame, and who they are.
-
-    Attributes:
-        stamp_ns: capture.
-        bodies: (N, 22, 3) metres, world.
-        confidence: (N, 22).
-        people: (N,) who is seen.
-    """
+class Frame(NamedTuple):
+    """Capture; bodies (N, 22, 3) metres, world; their confidence (N, 22); and who each of them is."""
 
     stamp_ns: int
     bodies: NDArray[np.float64]
@@ -64,14 +54,9 @@ def watch(stream: Stream) -> list[Frame]:
                 seen.append((body, who))
         order = rng.permutation(len(seen))
         joints = [to_canonical(skeleton, seen[k][0].positions.astype(float), seen[k][0].confidence) for k in order]
-        frames.append(
-            Frame(
-                message.stamp_ns,
-                np.array([p for p, _ in joints]).reshape(-1, 22, 3) @ turn.T + np.array(eye),
-                np.array([c for _, c in joints]).reshape(-1, 22),
-                [seen[k][1] for k in order],
-            )
-        )
+        places = np.array([p for p, _ in joints]).reshape(-1, 22, 3) @ turn.T + np.array(eye)
+        confidence = np.array([c for _, c in joints]).reshape(-1, 22)
+        frames.append(Frame(message.stamp_ns, places, confidence, [seen[k][1] for k in order]))
     return frames
 
 
@@ -83,11 +68,8 @@ def all_hidden(frames: list[Frame]) -> list[Frame]:
         return frames
     end = max(gaps)[1]
     hidden = range(end - round(0.5 * HIDDEN_S * 1e9), end + round(0.5 * HIDDEN_S * 1e9))
-    return [dataclasses.replace(f, **_nobody()) if f.stamp_ns in hidden else f for f in frames]
-
-
-def _nobody() -> dict[str, Any]:
-    return {"bodies": np.zeros((0, 22, 3)), "confidence": np.zeros((0, 22)), "people": []}
+    nobody = np.zeros((0, 22, 3)), np.zeros((0, 22)), []
+    return [Frame(f.stamp_ns, *nobody) if f.stamp_ns in hidden else f for f in frames]
 
 
 def _people(raw: list[PoseRaw], truth: list[PoseWorld]) -> dict[int, int]:

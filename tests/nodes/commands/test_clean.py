@@ -7,10 +7,11 @@ from conftest import START_NS, record, walk, walked, write_npz
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
+from tests.helpers.bodies import clean_body, world_body
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean, PoseWorld, Tracking, WorldBody
+from steadypose.msgs.types import JointState, Pose, PoseClean, PoseWorld
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
@@ -112,15 +113,11 @@ def answers(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tu
     positions = np.full((22, 3), position)
     rotations = np.tile(turn.as_quat(), (22, 1))
     state = np.full(22, JointState.SEEN if position < 0.5 else JointState.IMPUTED)
-    ones, zeros = np.ones(22), np.zeros((22, 3))
-    sensor = Pose.identity()
-    made = CleanBody(body, positions, rotations, state, ones * position, position, False, ones, ones, zeros, ones)
-    placed = WorldBody(
-        body, zeros[0], turn.as_quat(), np.full(3, position), np.eye(6), positions, rotations, state, ones, np.ones(8),
-        Tracking.OK,
-    )  # fmt: skip
+    same = {"id": body, "state": state}
+    made = clean_body(positions, rotations=rotations, sigma=np.full(22, position), anomaly=position, **same)
+    placed = world_body(positions, rotations, root_velocity=np.full(3, position), **same)
     return (
-        PoseClean(stamp_ns, "camera", "test", sensor, True, 4, [made]),
+        PoseClean(stamp_ns, "camera", "test", Pose.identity(), True, 4, [made]),
         PoseWorld(stamp_ns, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), [placed]),
     )
 

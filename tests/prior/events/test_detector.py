@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from tests.helpers.bodies import world_body
 
-from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking, WorldBody
+from steadypose.msgs.types import Event, EventKind, Hand, JointState, Phase, PoseWorld, Tracking
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.events.detector import EventDetector, EventSettings
 from steadypose.prior.events.features import features
@@ -62,22 +63,9 @@ def pointing() -> Pose:
 
 
 def message(index: int, *poses: Pose, sigma: float = 0.01, tracking: Tracking = Tracking.OK) -> PoseWorld:
-    bodies = [
-        WorldBody(
-            id=k,
-            root_position=p[0],
-            root_orientation=np.array([0.0, 0.0, 1.0, 0.0]),
-            root_velocity=np.zeros(3),
-            covariance=np.eye(6) * sigma**2,
-            positions=p,
-            rotations=np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)),
-            state=np.where(np.isfinite(p).all(axis=1), JointState.SEEN, JointState.UNKNOWN),
-            sigma=np.full(22, sigma),
-            contacts=np.zeros(8),
-            tracking=tracking,
-        )
-        for k, p in enumerate(poses)
-    ]
+    known = [np.where(np.isfinite(p).all(axis=1), JointState.SEEN, JointState.UNKNOWN) for p in poses]
+    same = {"root_orientation": np.array([0.0, 0.0, 1.0, 0.0]), "sigma": np.full(22, sigma), "tracking": tracking}
+    bodies = [world_body(p, id=k, state=known[k], covariance=np.eye(6) * sigma**2, **same) for k, p in enumerate(poses)]
     return PoseWorld(START_NS + index * FRAME_NS, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies)
 
 
@@ -130,9 +118,7 @@ def test_a_pose_begins_one_event_within_a_third_of_a_second_and_ends_it(
 def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits(
     calibrated: bool, height: float, hips: bool, guess: float
 ) -> None:
-    """Legs are guessed to stand, always, and as those of somebody taller or shorter; a floor that
-    is lower or unknown changes what is known of them. Hips that are hidden too are known by the neck, although their
-    place is 20 cm uncertain and there is no estimate of the ankles."""
+    # legs are guessed to stand, always; hips that are hidden too are known by the neck
     legs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
     ankles = [J["left_ankle"], J["right_ankle"]]
     guessed = legs if hips else [*legs, J["pelvis"], J["left_hip"], J["right_hip"]]
