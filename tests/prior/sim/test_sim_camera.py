@@ -36,10 +36,6 @@ def filmed(people: list[Motion], camera: Camera = LEVEL, noise: NoiseModel = SIL
     return film(people, camera, noise, np.random.default_rng(seed), "test", 0)
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# Line of sight
-
-
 def test_a_hand_behind_the_back_is_hidden_and_one_beside_the_head_is_not() -> None:
     before, behind = waving().at(np.array([0.2])), waving().at(np.array([5.0]))
     eye = np.array([0.0, 0.0, 1.4])
@@ -73,10 +69,6 @@ def test_the_gap_between_segments_is_the_least_distance(
     assert gap <= brute + 1e-5, "of segments that are all but parallel, to the micrometre"
     assert gap >= brute - coarse
     assert 0 <= along <= 1
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Frames
 
 
 def test_joints_are_in_the_optical_frame_of_the_pose_that_is_told() -> None:
@@ -139,10 +131,6 @@ def test_distance_makes_the_quick_noise_worse() -> None:
         return float(np.nanmedian(np.abs(np.diff(np.array(bodies), 2, axis=0))))
 
     assert shake(4.0) > 1.5 * shake(2.0)
-
-
-# ---------------------------------------------------------------------------------------------------------------
-# Sensors
 
 
 @pytest.mark.parametrize("name", ["smpl22", "coco17", "blazepose33", "kinect22"])

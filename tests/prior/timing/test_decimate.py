@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.resample import DecimationFilter, Frame
 
 HZ = 60
@@ -74,9 +75,7 @@ def test_stamps_are_believed() -> None:
 
 
 def test_noise_that_lasts_is_left_alone() -> None:
-    rng, noise = np.random.default_rng(0), np.zeros((6 * HZ, 1, 22, 3))
-    for t in range(1, len(noise)):
-        noise[t] = 0.98 * noise[t - 1] + 0.002 * rng.standard_normal((1, 22, 3))
+    noise = time_correlated(0.01 * np.random.default_rng(0).standard_normal((6 * HZ, 1, 22, 3)), 0.98)
     out = np.stack([f.positions for f in through(frames(noise))])
     assert 0.97 < out[HZ:].std() / noise[HZ:].std() <= 1.0
 
