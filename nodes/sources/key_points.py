@@ -84,15 +84,13 @@ def read_key_points(path: Path) -> KeyPointRecording:
     focal = np.asarray(arrays["focal"], dtype=np.float64).ravel()
     focal = focal.repeat(2) if focal.size == 1 else focal
     centre = np.asarray(arrays["centre"], dtype=np.float64).ravel()
-    for what, value, fits in (
-        ("confidence", confidence, confidence.shape == keypoints.shape[:2]),
-        ("focal", focal, focal.shape == (2,) and bool((focal > 0).all())),
-        ("centre", centre, centre.shape == (2,)),
+    for what, wanted, value, fits in (
+        ("confidence", "a finite number of each key point", confidence, confidence.shape == keypoints.shape[:2]),
+        ("focal", "pixels above 0, one number or two, of x and y", focal, focal.shape == (2,) and (focal > 0).all()),
+        ("centre", "pixels, two finite numbers, of x and y", centre, centre.shape == (2,)),
     ):
         if not fits or not np.isfinite(value).all():
-            raise NpzError(
-                f"{path}: {what}: expected finite numbers, of each key point, or of x and y; got {value!r:.80}"
-            )
+            raise NpzError(f"{path}: {what}: expected {wanted}; got {arrays[what]!r:.80}")
     try:
         pose = Pose.from_up(str(arrays.get("up", "-y")))
     except ValueError as error:

@@ -149,7 +149,7 @@ def test_what_cannot_be_done_is_said(
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ({"focal": -1.0}, "focal"),
+        ({"focal": -900.0}, r"focal: expected pixels above 0, one number or two.*got array\(-900"),
         ({"centre": [1.0]}, "centre"),
         ({"skeleton": "nobody"}, "skeleton"),
         ({"keypoints": np.zeros((4, 3, 2))}, "keypoints"),
