@@ -90,11 +90,7 @@ def show(table: Table, console: Console) -> None:
         in_a_line = [max(_width(table, column), len(table.columns[column])) + 2 for column in columns]
         wraps = sum(in_a_line) > room
         grid = RichTable(
-            title=None if number else table.title,
-            title_justify="left",
-            box=None,
-            pad_edge=False,
-            header_style="bold",
+            title=None if number else table.title, title_justify="left", box=None, pad_edge=False, header_style="bold"
         )
         grid.add_column(table.columns[0], width=first, overflow="fold")
         for column, whole in zip(columns, in_a_line, strict=True):

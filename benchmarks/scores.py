@@ -144,11 +144,7 @@ _LEAST = 1e-6
 
 
 def source_table(
-    name: str,
-    title: str,
-    errors: Mapping[tuple[str, str], NDArray[np.float64]],
-    clips: MotionClips,
-    baseline: str,
+    name: str, title: str, errors: Mapping[tuple[str, str], NDArray[np.float64]], clips: MotionClips, baseline: str
 ) -> Table:
     """Build a table with a column for each source, the mean over people, and its ratio to ``baseline`` in the same
     condition.

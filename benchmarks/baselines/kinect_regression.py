@@ -110,12 +110,7 @@ class TemporalConvolution(nn.Module):
 
 
 def temporal_convolution(
-    train: Sequence[Smoothed],
-    truths: Sequence[Floats],
-    mirror: Sequence[int],
-    ahead: int,
-    steps: int,
-    seed: int,
+    train: Sequence[Smoothed], truths: Sequence[Floats], mirror: Sequence[int], ahead: int, steps: int, seed: int
 ) -> Callable[[Smoothed], Floats]:
     """Fit a temporal convolution, as `ridge` fits a regression.
 

@@ -58,8 +58,4 @@ def _features(positions: Floats, turned: Floats) -> Floats:
 
 def baselines(clips: MotionClips, seed: int) -> Mapping[str, Baseline]:
     """Return the baselines by name; ``clips`` are of training people."""
-    return {
-        "hips and shoulders": trunk_frame,
-        "trunk, Kabsch": kabsch,
-        "trunk, Kabsch and ridge": ridge(clips, seed),
-    }
+    return {"hips and shoulders": trunk_frame, "trunk, Kabsch": kabsch, "trunk, Kabsch and ridge": ridge(clips, seed)}

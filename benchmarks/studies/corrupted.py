@@ -92,11 +92,7 @@ def run_conditions(
 
 
 def _record(
-    condition: str,
-    answer: Answer,
-    scores: Scores,
-    scored: Sequence[tuple[Answer, Scores]],
-    people: NDArray[np.str_],
+    condition: str, answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
 ) -> dict[str, Any]:
     record: dict[str, Any] = {
         "condition": condition,

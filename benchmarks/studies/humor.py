@@ -199,16 +199,9 @@ def run(bench: Bench) -> Result:
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
     few = len(clips.offsets)
-    records = {
-        "futures": futures,
-        "noisy": noisy,
-        "hidden": hidden,
-        "detector": detector,
-        "depth": depth,
-    }
+    records = {"futures": futures, "noisy": noisy, "hidden": hidden, "detector": detector, "depth": depth}
     return Result(
-        [_futures_table(futures, count), *_fit_tables(records, few)],
-        {"data": clips.source, "records": records},
+        [_futures_table(futures, count), *_fit_tables(records, few)], {"data": clips.source, "records": records}
     )
 
 

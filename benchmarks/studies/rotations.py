@@ -33,14 +33,7 @@ from steadypose.benchmarks.intervals import Interval, ratio
 from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped, starts_of
-from steadypose.benchmarks.studies.rotations_truth import (
-    SCORED,
-    SKIPPED,
-    align,
-    angle,
-    read,
-    score,
-)
+from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, align, angle, read, score
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations

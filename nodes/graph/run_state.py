@@ -136,10 +136,7 @@ def losses(diagnostics: Diagnostics, *kinds: str) -> str:
 
 
 def write_health(
-    directory: Path,
-    required: Sequence[str],
-    supervisor: Supervisor,
-    diagnostics: Mapping[str, Diagnostics],
+    directory: Path, required: Sequence[str], supervisor: Supervisor, diagnostics: Mapping[str, Diagnostics]
 ) -> None:
     """Write ``health.json``, the state of a run, for monitoring a machine without a screen.
 

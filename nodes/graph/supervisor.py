@@ -169,12 +169,7 @@ class Supervisor:
     """Runs the nodes of a launch, each in its own process. A context manager; leaving it stops all nodes."""
 
     def __init__(
-        self,
-        nodes: Sequence[str],
-        arguments: Sequence[str],
-        clock: Clock,
-        log: Callable[[str], None],
-        run: str = "",
+        self, nodes: Sequence[str], arguments: Sequence[str], clock: Clock, log: Callable[[str], None], run: str = ""
     ) -> None:
         """Start ``steadypose node NAME`` with the same arguments for each of the nodes.
 

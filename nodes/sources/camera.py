@@ -22,13 +22,7 @@ from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.nodes.checks.wire import check_wire
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.settings import LaunchError, check_addresses
-from steadypose.nodes.sources.source import (
-    MODEL,
-    LiveSource,
-    OakSettings,
-    SourceContext,
-    WebcamSettings,
-)
+from steadypose.nodes.sources.source import MODEL, LiveSource, OakSettings, SourceContext, WebcamSettings
 
 if TYPE_CHECKING:
     from steadypose.nodes.sources.webcam_device import VideoSource

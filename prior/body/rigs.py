@@ -178,10 +178,7 @@ def up_axis(bodies: Floats) -> str:
 
 
 def skeleton(
-    name: str,
-    middle: Mapping[str, str | Mixture],
-    left: Mapping[str, str | Mixture],
-    to_right: Callable[[str], str],
+    name: str, middle: Mapping[str, str | Mixture], left: Mapping[str, str | Mixture], to_right: Callable[[str], str]
 ) -> Skeleton:
     """Build a skeleton from its canonical joints of the ``middle`` and of the ``left`` side, named without the side.
     ``to_right`` maps a joint of the file's left to the right; other joints stay the same.

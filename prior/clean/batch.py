@@ -19,14 +19,7 @@ import numpy as np
 from steadypose.msgs.types import PoseClean, PoseRaw
 from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import Skeleton
-from steadypose.prior.clean.adapt import (
-    BodyJoints,
-    Lately,
-    clean_bodies,
-    clean_message,
-    end_of_stream,
-    layout_of,
-)
+from steadypose.prior.clean.adapt import BodyJoints, Lately, clean_bodies, clean_message, end_of_stream, layout_of
 from steadypose.prior.clean.admission import SLOWEST_NS, SensorPoseGate, StampGate, Verdict
 from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.clean.identify import Identify

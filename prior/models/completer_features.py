@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
-from steadypose.prior.body.kinematics import (
-    from_rotation_vectors,
-    heading,
-    quaternions,
-    rotation_matrices,
-    yaw_matrix,
-)
+from steadypose.prior.body.kinematics import from_rotation_vectors, heading, quaternions, rotation_matrices, yaw_matrix
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.line import Line, draw_line, lerp, write_slerp, write_splines

@@ -132,13 +132,7 @@ class MixtureNet(nn.Module):
 
 
 def answer(
-    outputs: Tensor,
-    experts: Tensor,
-    heading: Tensor,
-    scale: Tensor,
-    gap: Tensor,
-    between: Tensor,
-    fallback: Tensor,
+    outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor, between: Tensor, fallback: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².
 

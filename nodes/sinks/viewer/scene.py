@@ -207,8 +207,7 @@ class PoseView:
             )
             touching = body.contacts > CONTACT_PROBABILITY
             self._log(
-                f"{path}/contacts",
-                rr.Points3D(positions[CONTACT_INDICES[touching]], colors=CONTACT_RGB, radii=0.035),
+                f"{path}/contacts", rr.Points3D(positions[CONTACT_INDICES[touching]], colors=CONTACT_RGB, radii=0.035)
             )
             arrow = rr.Arrows3D(
                 origins=[body.root_position], vectors=[body.root_velocity], colors=PATH_RGB, radii=0.012
