@@ -75,15 +75,10 @@ def available(settings: PriorSettings, delay: int) -> bool:
 
 
 def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, skeleton: str = "smpl22") -> Cleaned:
-    """Clean clips with ``PriorPipeline``.
+    """Clean clips (T, C, J, 3) metres, z up, NaN where missing, in the layout ``skeleton`` by ``PriorPipeline``, with
+    these settings but this delay.
 
-    Args:
-        settings: the variant; its delay is overridden.
-        seen: (T, C, J, 3) metres, z up, NaN where missing. A clip ends after its last frame with a joint. A frame
-            without any joint in any clip counts as lost.
-        stamps_s: (T,) seconds of capture.
-        delay: frames.
-        skeleton: layout of the J joints.
+    A clip ends after its last frame with a joint. A frame without any joint in any clip counts as lost.
     """
     slots = SLOTS_A_CLIP * min(SIDE_BY_SIDE, seen.shape[1])
     prior = PriorPipeline(replace(settings, delay=delay, max_bodies=slots))

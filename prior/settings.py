@@ -65,15 +65,10 @@ def _warn_of_unused(section: str, keys: str) -> None:
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
-    """Build a settings dataclass from a mapping, strictly; nested dataclasses from nested mappings.
+    """Build a settings dataclass from a mapping, strictly; nested dataclasses from nested mappings. ``path`` is the
+    section's name, such as ``prior.gate``; empty for a whole launch file.
 
-    Args:
-        cls: the dataclass.
-        settings: its values.
-        path: the section's name, such as ``prior.gate``; empty for a whole launch file.
-
-    Raises:
-        ValueError: a key is unknown or a type wrong; the message says what was expected and what was given.
+    Raises ValueError for an unknown key or a wrong type; the message says what was expected and what was given.
     """
     defaults = cls()
     values: dict[str, Any] = {}

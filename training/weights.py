@@ -20,13 +20,10 @@ from steadypose.training.distributed import writes
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
-    """Write weights, in half precision, with configuration and card, in the first process of torchrun.
+    """Write weights (``.safetensors``), in half precision, with the configuration as JSON and a card, in the first
+    process of torchrun.
 
-    Args:
-        path: path that ends in ``.safetensors``; the card is written beside it as ``.md``.
-        model: the model whose state dict is saved.
-        config: configuration that rebuilds the model, saved as JSON in the file's metadata.
-        card: heading to content: data, licence, seed, training command, results.
+    ``card`` is content by heading: data, licence, seed, training command, results; it is written beside as ``.md``.
     """
     if not writes():
         return

@@ -113,16 +113,11 @@ class Bones:
 def filtered(
     net: nn.Module, seen: Floats, stamps_s: Floats, delay: int, alpha: float, theta: float, kept: float
 ) -> Floats:
-    """Filter clips; returns poses (T, C, 22, 3), metres, NaN before a joint's first measurement.
+    """Filter clips (T, C, 22, 3), metres, NaN where missing, by a network at 30 Hz; returns poses, NaN before a joint's
+    first measurement.
 
-    Args:
-        net: a `MotionModel`, at 30 Hz.
-        seen: (T, C, 22, 3) metres, NaN where missing.
-        stamps_s: (T,) seconds.
-        delay: frames; not used.
-        alpha: how fast trust in a measurement falls with speed, s²/m².
-        theta: trust above which a measurement is taken as it is.
-        kept: weight of the current frame against the last output.
+    Trust in a measurement falls by ``alpha`` (s²/m²) with speed; above ``theta`` the measurement is taken as it is.
+    ``kept`` is the weight of the current frame against the last output.
     """
     output, pose, covariance = seen.copy(), seen[0].copy(), np.ones(seen.shape[1:3])
     moved, returns = np.zeros_like(pose), np.zeros(covariance.shape, dtype=bool)

@@ -42,18 +42,11 @@ def process_noise(order: int, step: float) -> Floats:
 def fixed_lag(
     seen: Floats, stamps_s: Floats, delay: int, order: int, density: float, measurement_sigma: float = 0.02
 ) -> Floats:
-    """Estimate each frame, given the measurements up to ``delay`` frames later, or to the end.
+    """Estimate each frame (T, ..., 3) metres, NaN where missing, given those up to ``delay`` later, or to the end. The
+    result is NaN where a joint had not been observed yet.
 
-    Args:
-        seen: (T, ..., 3) metres, NaN where missing.
-        stamps_s: (T,) seconds.
-        delay: frames.
-        order: 2 for constant velocity, 3 for constant acceleration.
-        density: power spectral density of the noise on the next derivative: m²/s³ for 2, m²/s⁵ for 3.
-        measurement_sigma: metres.
-
-    Returns:
-        (T, ..., 3); NaN where a joint had not been observed yet.
+    ``order`` is 2 for constant velocity, 3 for constant acceleration; ``density`` is the power spectral density of the
+    noise on the next derivative: m²/s³ for 2, m²/s⁵ for 3.
     """
     sigma = np.full(seen.shape[:-1], measurement_sigma)
     return smooth(seen, stamps_s, delay, order, density, sigma).positions.reshape(seen.shape)

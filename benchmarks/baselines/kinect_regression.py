@@ -112,17 +112,10 @@ class TemporalConvolution(nn.Module):
 def temporal_convolution(
     train: Sequence[Smoothed], truths: Sequence[Floats], mirror: Sequence[int], ahead: int, steps: int, seed: int
 ) -> Callable[[Smoothed], Floats]:
-    """Fit a temporal convolution, as `ridge` fits a regression.
+    """Fit a temporal convolution, as `ridge` fits a regression, to clips and their truths (T, 13, 3).
 
-    Six people are few, so half of each batch is mirrored, and all joints of a window are shifted a little.
-
-    Args:
-        train: clips.
-        truths: their truths, (T, 13, 3).
-        mirror: index of the other side's joint, for each of the 13 joints.
-        ahead: number of frames in the window after the estimated one.
-        steps: number of training steps.
-        seed: seed of weights and sampling.
+    Six people are few, so half of each batch is mirrored (``mirror`` is the other side's joint of each), and all joints
+    of a window are shifted a little. ``ahead`` frames of the window follow the estimated one.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)

@@ -76,15 +76,11 @@ class Clip(NamedTuple):
 
 
 def mocap_clips(path: Path, measured: bool, most: int) -> list[Clip]:
-    """Return clips of ``prepared.npz``: those on which the thresholds were chosen, or the others, which measure them.
+    """Return clips of ``prepared.npz``: those on which the thresholds were chosen, or the others, which measure them;
+    at most ``most`` per action of a data set, equally many of each person.
 
     The thresholds were chosen on Bandai-Namco's session and LAFAN1's actor, which validate the networks, and on
     UI-PRMD's s07.
-
-    Args:
-        path: path of the file.
-        measured: whether to return the people who measure.
-        most: largest number of clips per action of a data set, equally many of each person.
     """
     with np.load(path) as data:
         source, action, subject, split = (data[key] for key in ("source", "action", "subject", "split"))

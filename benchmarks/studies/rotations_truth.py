@@ -169,19 +169,12 @@ _BONE = np.array([REST_OFFSETS[child_of(j)] / np.linalg.norm(REST_OFFSETS[child_
 
 
 def align(truth: Floats, perfect: Floats) -> Floats:
-    """Return the file's orientations in a method's own convention: ``truth @ A``.
+    """Return the file's orientations (T, C, 17, 3, 3) in a method's own convention: ``truth @ A``.
 
     A file's joint at rest has another orientation than the canonical one and than any method's. A (C, 17, 3, 3), one
     constant rotation per clip and joint, is the median of ``truth.T @ perfect`` over the clip (Weiszfeld's rounds on
     chordal means). ``perfect`` is the method's output for the joints without noise. What then differs on a noise-free
     input is definition: a pelvis computed from hips and spine bends with the spine, and a straight limb shows no twist.
-
-    Args:
-        truth: (T, C, 17, 3, 3) of the file.
-        perfect: (T, C, 17, 3, 3) of the method.
-
-    Returns:
-        (T, C, 17, 3, 3).
     """
     apart = truth.swapaxes(-1, -2) @ perfect
     weight, mean = np.ones(apart.shape[:-2]), apart[0]

@@ -46,15 +46,11 @@ BACK_NS = 1_000_000_000
 
 
 class Relay:
-    """Tracks the inputs of a node and the outputs that they caused.
+    """Tracks the inputs of a node and the outputs, on at most two ``topics``, that they caused.
 
-    Args:
-        file: stores the progress for the node's successor.
-        topics: topics that the node publishes, at most two.
-        supervisor: process id of the supervisor that would restart this node; 0 if there is none, and then no progress
-            is stored.
-        lag: number of acknowledged messages that the successor publishes again. A source needs this: if a subscriber
-            dies together with it, the source must supply that subscriber's context.
+    The progress is stored in ``file`` for the node's successor, unless ``supervisor``, the process id of what would
+    restart this node, is 0. The successor publishes ``lag`` acknowledged messages again: if a subscriber dies together
+    with a source, the source must supply that subscriber's context.
     """
 
     def __init__(self, file: Path, topics: tuple[str, ...], supervisor: int, lag: int = 0) -> None:

@@ -40,13 +40,9 @@ class Target(NamedTuple):
 class Foot:
     """One foot of a robot.
 
-    Args:
-        rest: (3, 3) rotation of the foot's link while the robot stands facing +x.
-        sole: height of the link's origin above the floor while the robot stands, metres.
-
-    Attributes:
-        stands: whether the person's foot stands, and the robot's is held or on its way down.
-        landed: whether it has come to stand.
+    ``rest`` is the rotation (3, 3) of the foot's link while the robot stands facing +x, ``sole`` the height of the
+    link's origin above the floor then, metres. It ``stands`` while the person's foot does, and the robot's is held or
+    on its way down; then it has ``landed``.
     """
 
     def __init__(self, rest: Floats, sole: float) -> None:

@@ -39,14 +39,9 @@ FEET = ("left_foot", "right_foot")
 class Solver:
     """Moves a robot's links towards their targets, frame by frame.
 
-    Args:
-        robot: the robot.
-        costs: for each part with a target, the costs of a metre and of a radian of error.
-        sole: height of the feet above the floor while the robot stands, metres.
-
-    Attributes:
-        home: (nq,) configuration of MuJoCo in which all joints are at 0, or at the limit next to it.
-        velocity: (nv,) last velocity, in MuJoCo's tangent space.
+    ``costs`` are those of a metre and of a radian of error, for each part with a target; ``sole`` is the height of the
+    feet above the floor while the robot stands, metres. ``home`` (nq,) is MuJoCo's configuration in which all joints
+    are at 0, or at the limit next to it; ``velocity`` (nv,) is the last one, in MuJoCo's tangent space.
     """
 
     def __init__(self, robot: Robot, costs: Mapping[str, tuple[float, float]], sole: float) -> None:

@@ -250,18 +250,11 @@ def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) 
 
 
 def label_contacts(positions: NDArray[np.floating], fps: float, speed: float = REST_SPEED) -> NDArray[np.bool_]:
-    """Label contacts from motion: joints that are slow and low.
+    """Label contacts (T, 8) of `CONTACT_JOINTS` from motion (T, 22, 3) metres, world, floor at z = 0: joints that are
+    low, and slower than ``speed`` m/s (`REST_SPEED` or `LOAD_SPEED`).
 
     Thresholds are in SI units, so labels do not depend on the frame rate (HuMoR's are per frame). Joint centres do not
     touch the floor, so heights are measured from the centre's height while the limb rests.
-
-    Args:
-        positions: (T, 22, 3) metres, world, floor at z = 0.
-        fps: frames per second.
-        speed: m/s, largest speed in contact: `REST_SPEED` or `LOAD_SPEED`.
-
-    Returns:
-        (T, 8) labels of `CONTACT_JOINTS`.
     """
     p = np.asarray(positions, dtype=np.float64)[:, list(CONTACT_JOINTS)]
     if len(p) < 2:

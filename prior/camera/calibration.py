@@ -300,20 +300,11 @@ def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
 
 
 def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
-    """Estimate the extrinsics of a camera that sees the floor. It is above the world's origin and looks along +y.
+    """Estimate the extrinsics of a camera that sees the floor, and the share of points on it. It is above the world's
+    origin and looks along +y.
 
-    The floor is the lowest of the large, approximately level planes.
-
-    Args:
-        points: (N, 3) metres, optical frame.
-        up: (3,) up direction from gravity, within `FLOOR_TILT`.
-        seed: random seed of the sampling.
-
-    Returns:
-        The pose, and the share of points on the floor.
-
-    Raises:
-        CalibrationError: no floor is visible.
+    The floor is the lowest of the large, approximately level planes of points (N, 3) metres, optical frame; ``up`` (3,)
+    is within `FLOOR_TILT` of upwards. Raises CalibrationError if no floor is visible.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     points = points[np.isfinite(points).all(axis=1)]

@@ -54,14 +54,9 @@ class _Newest(NamedTuple):
 class CleanCore:
     """Turns observations into clean frames, ``settings.delay`` frames later. Each stage keeps its own state, by slot.
 
-    It reads no clock and draws no random number: the same input gives the same output, bit for bit.
-
-    Args:
-        settings: of the prior.
-        counters: counts refused joints and skipped frames, by cause.
-
-    Attributes:
-        fuse: the stage before posture; public because training records its candidates.
+    It reads no clock and draws no random number: the same input gives the same output, bit for bit. ``counts`` are of
+    refused joints and skipped frames, by cause. ``fuse``, the stage before posture, is public because training records
+    its candidates.
     """
 
     def __init__(self, settings: PriorSettings, counters: Counter[str]) -> None:

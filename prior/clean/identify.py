@@ -58,18 +58,13 @@ _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
 
 
 class Identify:
-    """Assigns an id to each body of a frame.
+    """Assigns an id to each body of a frame; ``counters`` count ``too_many_bodies``.
 
-    Each row holds a track: a person, or a tentative track without an id. A constant-velocity Kalman filter predicts
-    each track's position. Bodies are first matched by position to tracks observed within `RECENT_S`. Each unmatched
-    body starts a tentative track. After ``birth`` seconds, or as soon as the score is decisive, a tentative track is
-    either recognised as a person out of sight or becomes a new person. The wait lets bone lengths average over several
-    frames.
-
-    Args:
-        settings: settings of this stage.
-        rows: largest number of tracks: visible, out of sight and tentative ones together.
-        counters: counts ``too_many_bodies``.
+    Each of the ``rows`` holds a track: a person, visible or out of sight, or a tentative track without an id. A
+    constant-velocity Kalman filter predicts each track's position. Bodies are first matched by position to tracks
+    observed within `RECENT_S`. Each unmatched body starts a tentative track. After ``birth`` seconds, or as soon as the
+    score is decisive, a tentative track is either recognised as a person out of sight or becomes a new person. The wait
+    lets bone lengths average over several frames.
     """
 
     def __init__(self, settings: IdentifySettings, rows: int, counters: Counter[str]) -> None:

@@ -63,15 +63,10 @@ class MirroredLimbs:
             values[slot] = 0
 
     def update(self, positions: Floats, expected: Floats, camera: Floats) -> tuple[Bools, Bools]:
-        """Mirror limbs back, in place.
+        """Mirror limbs of (S, 22, 3) metres, NaN where unobserved, back, in place, given their predictions (S, 22, 3),
+        NaN where unknown, and the position (3,) of the sensor.
 
-        Args:
-            positions: (S, 22, 3) metres, NaN where unobserved.
-            expected: (S, 22, 3) metres, the prediction; NaN where unknown.
-            camera: (3,) metres, position of the sensor.
-
-        Returns:
-            (S, 22) joints that were mirrored back, and joints for which this is given up in this frame.
+        Returns (S, 22) joints that were mirrored back, and joints for which this is given up in this frame.
         """
         back = np.zeros(positions.shape[:2], dtype=np.bool_)
         given_up = np.zeros_like(back)

@@ -246,13 +246,10 @@ def _describe(past, slots, body, joint, candidates, sigmas, sigma, unseen_s, see
 
 @njit(cache=True)
 def bridge(track, at, noise, place):
-    """Estimate a joint's position from its observations before and after; returns its deviation along an axis, metres.
+    """Estimate a joint's position in the frame ``at`` from its observations (T, 3) before and after, NaN where
+    unobserved, of this noise; returns its deviation. All in metres, along an axis.
 
-    Args:
-        track: (T, 3) metres, observations; NaN where unobserved.
-        at: index of the frame to be estimated.
-        noise: standard deviation of the observations along an axis, metres.
-        place: (3,) metres, written; NaN if the track has no observation before ``at``.
+    ``place`` (3,) is written; NaN if there is no observation before ``at``.
     """
     last = at
     while last >= 0 and math.isnan(track[last, 0]):

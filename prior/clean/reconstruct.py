@@ -94,14 +94,9 @@ class Denoise:
     def update(
         self, windows: BodyWindows | None, smoothed: Smoothed | None, history: History, jitter: Floats
     ) -> Smoothed | None:
-        """Add HG-VAE's reconstruction of the newest windows, and denoise the smoother's newest estimate if there is
-        one.
-
-        Args:
-            windows: the newest windows; None if no body is present.
-            smoothed: (S, 22) joints and their standard deviations, ``delay_frames`` before the newest frame.
-            history: the observations.
-            jitter: (S,) metres along an axis, estimated up to the newest frame.
+        """Add HG-VAE's reconstruction of the newest windows, if any, and denoise the smoother's newest estimate,
+        ``delay_frames`` before the newest frame, if any. ``jitter`` (S,) metres along an axis is estimated up to the
+        newest frame.
         """
         self._take(windows, history)
         return None if smoothed is None else self._denoised(smoothed, history, jitter, len(self._reconstructed) - 1)

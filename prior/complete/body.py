@@ -110,16 +110,9 @@ class Completed:
 def complete(
     fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[int], None] = lambda frames: None
 ) -> Completed:
-    """Complete a body's motion.
+    """Complete a body's motion (T, 22, 3) metres, z up, at 30 Hz, NaN where unknown, on bones (22, 3), by ``fill``.
 
-    Args:
-        fill: a completer.
-        positions: (T, 22, 3) metres, z up, at 30 Hz; NaN where unknown.
-        offsets: (22, 3) metres, the person's bones.
-        advanced: called with the end of each finished window.
-
-    Raises:
-        ValueError: no joint is known in any frame.
+    ``advanced`` is called with the end of each finished window. Raises ValueError if no joint is known in any frame.
     """
     known = finite_joints(positions)
     if not known.any():

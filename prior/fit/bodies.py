@@ -182,16 +182,11 @@ def fit_stream(
     began: Callable[[Sequence[Seen]], None] = lambda bodies: None,
     advanced: Callable[[], None] = lambda: None,
 ) -> list[Fit]:
-    """Fit every body of a cleaned stream that is present for long enough.
+    """Fit every body of a cleaned stream, including ``pose/raw``, that is present for long enough.
 
-    Args:
-        messages: messages of the stream, including ``pose/raw``.
-        surface: (T, N, 3) metres, points of the body's surface in the sensor's frame for each frame of ``pose/raw``,
-            padded with NaN; None if there are none.
-        model: the transition model.
-        folder: cache of finished windows, so that an interrupted call can resume.
-        began: called with the bodies.
-        advanced: called after each window.
+    ``surface`` (T, N, 3) metres are points of the body's surface in the sensor's frame for each frame of ``pose/raw``,
+    padded with NaN. ``folder`` is a cache of finished windows, so that an interrupted call can resume. ``began`` is
+    called with the bodies, ``advanced`` after each window.
     """
     bodies = bodies_seen(messages, MIN_FRAMES)
     stamps = np.array([m.stamp_ns for _, m in messages if isinstance(m, PoseRaw) and not m.end_of_stream], np.int64)

@@ -138,16 +138,11 @@ def fit_window(
     stages: int = 3,
     advanced: Callable[[], None] = lambda: None,
 ) -> Fitted:
-    """Fit a window of a few seconds, at least three frames.
+    """Fit a window of a few seconds, at least three frames, from initial poses to terms of observations, with a model
+    in evaluation mode.
 
-    Args:
-        model: the transition model, in evaluation mode.
-        start: initial poses.
-        observed: terms of the observations.
-        settings: settings of stages and terms.
-        anchor: the frames shared with the window before.
-        stages: number of stages; 2 stops before the motion model, which is HuMoR's VPoser-t.
-        advanced: called after each stage.
+    ``anchor`` has the frames shared with the window before. With 2 ``stages`` it stops before the motion model, which
+    is HuMoR's VPoser-t; ``advanced`` is called after each.
     """
     model.requires_grad_(False)
     variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)

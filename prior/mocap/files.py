@@ -78,15 +78,10 @@ def describe(table: Mapping[str, Any]) -> Description:
 
 @documented
 def read_motion(name: str, content: bytes, description: Description = UNDESCRIBED) -> Motion:
-    """Read a motion file in the format of its suffix, one of `SUFFIXES`.
+    """Read the content of a motion file in the format of its name's suffix, one of `SUFFIXES`; ``description`` has what
+    the file lacks.
 
-    Args:
-        name: name of the file, for its suffix and for error messages.
-        content: its bytes.
-        description: properties that the file lacks.
-
-    Raises:
-        MotionError: the file cannot be read, or contains no body.
+    Raises MotionError if the file cannot be read, or contains no body.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in _READERS:

@@ -160,12 +160,8 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
-    """Build the completer's input from windows.
-
-    Args:
-        positions: (B, T, 22, 3) metres, z up; NaN where unknown.
-        offsets: (B, 22, 3) metres, the person's bones.
-        usual: (22, 4) local quaternions, xyzw, of the mean pose.
+    """Build the completer's input from windows (B, T, 22, 3) metres, z up, NaN where unknown, of bones (B, 22, 3);
+    ``usual`` (22, 4) are local quaternions, xyzw, of the mean pose.
     """
     count, frames = positions.shape[:2]
     known = finite_joints(positions)

@@ -178,18 +178,8 @@ _FORGET_AFTER = 0.8  # time out of view after which a body gets a new id, second
 def film(
     people: Sequence[Motion], camera: Camera, noise: NoiseModel, rng: np.random.Generator, source: str, start_ns: int
 ) -> list[PoseRaw]:
-    """Simulate the camera's tracker output, frame by frame.
-
-    Args:
-        people: motions of equal duration.
-        camera: the camera.
-        noise: error model of its tracker.
-        rng: random generator.
-        source: the name of the stream.
-        start_ns: stamp of second 0 of the motions.
-
-    Returns:
-        Frames in the order of their stamps, with the `Camera.estimated_pose`.
+    """Simulate the camera's tracker output, with its error model, of motions of equal duration whose second 0 has the
+    stamp ``start_ns``: frames in the order of their stamps, with the `Camera.estimated_pose`.
     """
     times = camera.capture_times(min(m.times[-1] for m in people), rng)
     filmed = [m.at(times) for m in people]

@@ -39,18 +39,10 @@ class Key:
 
 
 def track(times: Floats, initial: ArrayLike, keys: Sequence[Key]) -> Floats:
-    """Interpolate a value from key to key, twice continuously differentiable.
+    """Interpolate a value (T, ...) at these times (T,) seconds from key to key, twice continuously differentiable.
 
     Each key adds its difference from the previous key along a minimum-jerk profile. Keys that overlap in time blend:
     the track passes near the first without stopping, like a hand at a via-point.
-
-    Args:
-        times: (T,) seconds.
-        initial: (...) value before the first key.
-        keys: keys in order.
-
-    Returns:
-        (T, ...).
     """
     previous = np.asarray(initial, dtype=np.float64)
     value = np.broadcast_to(previous, (len(times), *previous.shape)).copy()

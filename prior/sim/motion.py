@@ -196,18 +196,11 @@ def _lengths(offsets: Floats, middle: str, end: str) -> Floats:
 
 
 def two_bone(start: Floats, goal: Floats, pole: Floats, lengths: Floats) -> tuple[Floats, Floats, Floats]:
-    """Analytic two-bone inverse kinematics.
+    """Analytic two-bone inverse kinematics from shoulder or hip (T, 3) to a goal (T, 3), with elbow or knee towards
+    ``pole`` (T, 3).
 
     A goal nearer than the limb can fold, or farther than 99.9 % of its length, is approached as far as possible.
-
-    Args:
-        start: (T, 3) metres, position of shoulder or hip.
-        goal: (T, 3) metres, target of wrist or ankle.
-        pole: (T, 3) direction in which elbow or knee points.
-        lengths: (2,) metres, lengths of the two bones.
-
-    Returns:
-        Directions of both bones, (T, 3) each, and the hinge's axis (T, 3), about which the limb flexes.
+    Returns directions of both bones, (T, 3) each, and the hinge's axis (T, 3), about which the limb flexes.
     """
     upper, lower = lengths
     along = goal - start

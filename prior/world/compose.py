@@ -34,15 +34,11 @@ _MIN_NORM = 1e-6
 
 
 def fit_legs(positions: Floats, sigma: Floats, bone_lengths: NDArray[np.floating]) -> Floats:
-    """Move hips, knees, ankles and toes towards the lengths of the bones between them; returns (22, 3) metres.
+    """Move hips, knees, ankles and toes (22, 3) metres, NaN where unknown, towards the lengths (22,) of the bones
+    between them; a length not above 0 is unknown.
 
     The joints are weighted by their variances, and the lengths by theirs (compliant constraints, XPBD, Macklin et al.
     2016). The converged result is the maximum likelihood estimate.
-
-    Args:
-        positions: (22, 3) metres; NaN where unknown.
-        sigma: (22,) metres, standard deviations.
-        bone_lengths: (22,) metres from each joint to its parent; unknown if not above 0.
     """
     fitted = np.array(positions, dtype=np.float64, order="C")
     _fit(fitted, sigma**2, np.asarray(bone_lengths, dtype=np.float64))

@@ -62,15 +62,10 @@ class BodyStages:
 
 
 class Scene:
-    """State of one source: its bodies, and the floor that they share.
+    """State of one source: the stages' state of each body, by id, and the floor on which all stand.
 
-    Args:
-        calibrated: whether the floor is known to be at z = 0.
-
-    Attributes:
-        stamp_ns: stamp of the newest message; negative before the first.
-        floor: the floor on which all bodies stand.
-        bodies: the stages' state of each body, by id.
+    If ``calibrated``, the floor is known to be at z = 0. ``stamp_ns`` is of the newest message; negative before the
+    first.
     """
 
     def __init__(self, calibrated: bool) -> None:

@@ -78,13 +78,8 @@ class BodyNoise:
 class BodyFilter:
     """Kalman filter of root position and velocity, positions of ``feet`` points of the feet, and biases.
 
-    Args:
-        noise: process noise and correlation times.
-        position: (3,) metres, first observed position of the root.
-        jitter: metres, standard deviation of the sensor's error from frame to frame.
-        bias: metres, standard deviation of the sensor's slow bias.
-        velocity: (3,) m/s, initial velocity of the root.
-        feet: number of points of the feet.
+    It starts from the first observed position (3,) of the root, metres, and a velocity (3,) m/s; ``jitter`` and
+    ``bias`` are deviations of the sensor's error from frame to frame and of its slow one, metres.
     """
 
     def __init__(

@@ -55,14 +55,10 @@ def add_noise(positions: Floats, rng: Rng, bias_sigma: Floats) -> Floats:
 
 
 def vary_builds(positions: Floats, length_sigma: float, turn_sigma: float, rng: Rng) -> Floats:
-    """Augment windows by varying bone lengths and posture.
+    """Augment windows (B, T, 22, 3) metres by varying bone lengths and posture.
 
-    Args:
-        positions: (B, T, 22, 3) metres.
-        length_sigma: standard deviation of the logarithm of each bone's scale, which both sides share.
-        turn_sigma: radians, upper bound of the standard deviation, drawn for each window, of a constant rotation of
-            each bone about each axis.
-        rng: random generator.
+    ``length_sigma`` is the standard deviation of the logarithm of each bone's scale, which both sides share;
+    ``turn_sigma`` bounds that, drawn for each window, of a constant rotation of each bone about each axis, radians.
     """
     count, joints = len(positions), len(PARENTS)
     factor = np.exp(length_sigma * rng.standard_normal((count, joints)))

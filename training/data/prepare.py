@@ -88,16 +88,11 @@ def at_speed(clip: Clip, speed: float) -> Clip | None:
 
 
 def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> Iterator[Prepared | Dropped]:
-    """Resample a recording, estimate its floor, check and label it.
+    """Resample a recording, as read or of `at_speed`, estimate its floor, check and label it.
 
     Yields its valid parts, and the dropped parts with the reasons. A recording is cut where joints are lost or move
-    impossibly. A part is named by the second at which it begins.
-
-    Args:
-        clip: the clip as read, or from `at_speed`.
-        weights: the set of weights it may train.
-        split: training, validation or test.
-        speed: factor by which it is sped up, which raises the limit of accelerations.
+    impossibly. A part is named by the second at which it begins. ``speed`` is the factor by which it is sped up, which
+    raises the limit of accelerations.
     """
     clip = clip.canonical()
     if clip.seconds < MIN_SECONDS:

@@ -82,13 +82,10 @@ def name_series(recording: rr.RecordingStream) -> None:
 
 
 def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool = False) -> rrb.Blueprint:
-    """The layout of scenes and plots in the window.
+    """The layout of scenes and plots in the window, seen from ``eye`` if a body was observed.
 
-    Args:
-        eye: the initial viewpoint; None until a body was observed.
-        calibrated: whether the floor's height is known, and the floor is drawn in raw and clean.
-        scored: whether the prior gives anomaly scores to plot.
-        images: whether there are camera images to draw the clean poses over.
+    If ``calibrated``, the floor is drawn in raw and clean too; anomaly scores are plotted if ``scored``, and clean
+    poses drawn over camera images if there are any.
     """
     import rerun.blueprint as rrb
 

@@ -72,12 +72,9 @@ class MixtureSmoother:
     def update(
         self, positions: NDArray[np.float64], stamp_s: float, confidence: NDArray[np.float64] | None = None
     ) -> Smoothed | None:
-        """Process a frame and return the estimate of the frame ``delay`` earlier, or None if there is none yet.
-
-        Args:
-            positions: (S, 22, 3) metres, world-aligned with z up, NaN where unobserved.
-            stamp_s: time of capture, seconds, increasing.
-            confidence: (S, 22) 0 to 1; 1 if omitted.
+        """Process a frame (S, 22, 3) metres, world-aligned with z up, NaN where unobserved, of an increasing stamp in
+        seconds, and return the estimate of the frame ``delay`` earlier, or None if there is none yet. ``confidence``
+        (S, 22) is 1 if omitted.
         """
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
