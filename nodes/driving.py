@@ -68,9 +68,7 @@ class Diagnosis:
 
     def __init__(self, settings: PriorSettings) -> None:
         self.problems: dict[str, str] = {}
-        self._check = StreamCheck(
-            settings.max_bodies, identified=settings.identify.enabled, min_confidence=settings.gate.min_confidence
-        )
+        self._check = StreamCheck(settings)
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
         self._last_ns = self._span_ns = self._back_ns = 0
@@ -148,19 +146,11 @@ class Diagnosis:
 
 
 class OfflineRun:
-    """Runs both pipelines on a recorded source. It can be iterated once, and yields the messages of `stream`.
+    """Runs both pipelines on a recorded source, with ``[prior]`` and ``[trajectory]`` of a launch file. It can be
+    iterated once, and yields the messages of `stream`.
 
-    Args:
-        source: the recording.
-        settings: ``[prior]`` and ``[trajectory]`` of a launch file.
-        timeline: collects the events, if given.
-
-    Attributes:
-        diagnosis: problems of the input.
-        poses: number of bodies in the output so far.
-
-    Raises:
-        LaunchError: a setting is unknown, or its value is invalid.
+    ``timeline``, if given, collects the events; ``diagnosis`` has the problems of the input, ``poses`` counts the
+    bodies in the output so far. Raises LaunchError if a setting is unknown, or its value is invalid.
     """
 
     def __init__(self, source: RecordedSource, settings: Settings, timeline: EventTimeline | None = None) -> None:

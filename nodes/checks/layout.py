@@ -13,6 +13,7 @@ from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, bodies, error, some_bodies, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
+from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
@@ -21,13 +22,9 @@ ENOUGH = 5
 """Smallest number of messages to judge by."""
 
 
-def check_layout(
-    messages: Sequence[PoseRaw], max_bodies: int, min_confidence: float, *, identified: bool
-) -> Iterator[Problem]:
-    """Problems with the layout, sensor pose, confidences and ids in a window of messages, for a prior that tracks
-    ``max_bodies``, takes joints of less than ``min_confidence`` as unobserved and, if ``identified``, assigns ids
-    itself.
-    """
+def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterator[Problem]:
+    """Problems with the layout, sensor pose, confidences and ids in a window of messages, for a prior of these
+    settings."""
     if len(messages) < ENOUGH:
         return
     newest = messages[-1]
@@ -41,9 +38,9 @@ def check_layout(
         yield _wrong_count(messages, skeleton, common)
         return
     few = some_bodies(messages)
-    yield from _confidence(few, min_confidence)
+    yield from _confidence(few, settings.gate.min_confidence)
     yield from _seen(few)
-    yield from _ids(messages, max_bodies, identified)
+    yield from _ids(messages, settings.max_bodies, settings.identify.enabled)
 
 
 def _unknown(messages: Sequence[PoseRaw]) -> Problem:

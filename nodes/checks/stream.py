@@ -6,7 +6,6 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_
 from steadypose.nodes.checks.layout import check_layout
 from steadypose.nodes.checks.problem import Problem, Window, error, some_bodies, warning
 from steadypose.nodes.checks.stamps import check_stamps
+from steadypose.prior.clean.settings import PriorSettings
 
 ENOUGH = 20
 """Smallest number of bodies between two checks to judge by."""
@@ -81,10 +81,10 @@ NOBODY = 60
 
 
 class StreamCheck:
-    """Checks a stream of ``pose/raw`` for misuse; the arguments are those of `check_layout`."""
+    """Checks a stream of ``pose/raw`` for misuse, for a prior of these settings."""
 
-    def __init__(self, max_bodies: int, *, identified: bool = False, min_confidence: float = 0.0) -> None:
-        self._max_bodies, self._identified, self._min_confidence = max_bodies, identified, min_confidence
+    def __init__(self, settings: PriorSettings) -> None:
+        self._settings = settings
         self._window = Window()
         self._heard_ns = 0
         self._ended = False
@@ -129,7 +129,7 @@ class StreamCheck:
         if not messages:
             return
         stamps = list(check_stamps(arrivals, live=live))
-        names = list(check_layout(messages, self._max_bodies, self._min_confidence, identified=self._identified))
+        names = list(check_layout(messages, self._settings))
         yield from (*stamps, *names)
         if not self._window.inhabited and self._window.received >= NOBODY:
             yield warning(
@@ -143,7 +143,7 @@ class StreamCheck:
         shape = list(check_geometry(few))
         yield from shape
         # ids that the prior ignores may change between people
-        if _usable(stamps) and not self._identified:
+        if _usable(stamps) and not self._settings.identify.enabled:
             jumps = list(check_jumps(few))
             yield from jumps
             if _usable(shape) and not jumps:
@@ -157,9 +157,8 @@ def _usable(problems: list[Problem]) -> bool:
 class StreamChecks:
     """The checks of all ``streams`` of a prior: a single one, or one per client, identified by its source."""
 
-    def __init__(self, max_bodies: int, *, identified: bool, streams: int, min_confidence: float = 0.0) -> None:
-        self._new = partial(StreamCheck, max_bodies, identified=identified, min_confidence=min_confidence)
-        self._streams = streams
+    def __init__(self, settings: PriorSettings, streams: int) -> None:
+        self._settings, self._streams = settings, streams
         self._checks: dict[str, StreamCheck] = {}
 
     @property
@@ -170,7 +169,7 @@ class StreamChecks:
     def see(self, raw: PoseRaw, at_ns: int) -> None:
         """Record a message that arrived at wall time ``at_ns``."""
         source = raw.source if self._streams > 1 else ""
-        check = self._checks.pop(source, None) or self._new()
+        check = self._checks.pop(source, None) or StreamCheck(self._settings)
         self._checks[source] = check
         if len(self._checks) > self._streams:
             del self._checks[next(iter(self._checks))]

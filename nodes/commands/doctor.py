@@ -91,10 +91,7 @@ def listen(launch_file: str, console: Console) -> int:
 
     clock, launch = SystemClock(), Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
-    settings = launch.settings(PriorSettings)
-    check = StreamCheck(
-        settings.max_bodies, identified=settings.identify.enabled, min_confidence=settings.gate.min_confidence
-    )
+    check = StreamCheck(launch.settings(PriorSettings))
     addresses, nodes_at = launch.addresses("pose_input"), [transport.endpoint(name) for name in POSE_NODES]
     reported: dict[str, str] = {}
     frames: list[PoseRaw] = []

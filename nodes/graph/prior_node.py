@@ -53,12 +53,7 @@ class PriorNode(Node):
         self._bodies = 0
         self._anomalies = 0
         self._answers = Answers(self._pipeline.counters, identified=settings.identify.enabled)
-        self._checks = StreamChecks(
-            settings.max_bodies,
-            identified=settings.identify.enabled,
-            min_confidence=settings.gate.min_confidence,
-            streams=clients or 1,
-        )
+        self._checks = StreamChecks(settings, clients or 1)
         # such a replay has no timeline
         self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
         self._started_ns = self.clock.now_ns()

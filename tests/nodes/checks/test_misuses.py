@@ -28,6 +28,7 @@ from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
+from steadypose.prior.clean.settings import IdentifySettings, PriorSettings
 
 SECOND_NS = 1_000_000_000
 SOON_S = 3.0
@@ -191,7 +192,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
 
 def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str, tuple[float, Level, str]]:
     """What is told of a stream that comes at its own rate: by cause, when first, in seconds from the first message."""
-    check, found, due = StreamCheck(max_bodies, min_confidence=0.1), {}, START_NS + SECOND_NS
+    check, found, due = StreamCheck(PriorSettings(max_bodies=max_bodies)), {}, START_NS + SECOND_NS
     for index, raw in enumerate(frames):
         at_ns = START_NS + index * SECOND_NS // 30
         while at_ns >= due:
@@ -254,7 +255,7 @@ def test_a_layout_for_another_of_as_many_joints(named: str, meant: str) -> None:
 
 @pytest.mark.parametrize("identified", [False, True])
 def test_what_the_ids_say_counts_only_where_they_are_used(identified: bool) -> None:
-    check = StreamCheck(8, identified=identified)
+    check = StreamCheck(PriorSettings(identify=IdentifySettings(enabled=identified)))
     for index, raw in enumerate(walk()):
         check.see(ONE_ID_IN_TURN(raw, index), raw.stamp_ns)
     found = [problem.cause for problem in check.problems(START_NS + 3 * SECOND_NS, live=True)]
@@ -262,7 +263,7 @@ def test_what_the_ids_say_counts_only_where_they_are_used(identified: bool) -> N
 
 
 def test_a_short_hold_up_is_no_clock_that_was_set() -> None:
-    check = StreamCheck(8)
+    check = StreamCheck(PriorSettings())
     for index, raw in enumerate(walk()):
         due = START_NS + index * SECOND_NS // 30
         held_until = START_NS + 2 * SECOND_NS
@@ -396,7 +397,7 @@ def _named(raw: PoseRaw, skeleton: str) -> PoseRaw:
 @given(st.lists(of(PoseRaw), min_size=1, max_size=4), st.sampled_from([*SKELETONS, None]), st.booleans())
 @settings(max_examples=30)
 def test_whatever_comes_is_survived(raws: list[PoseRaw], skeleton: str | None, live: bool) -> None:
-    check = StreamCheck(2)
+    check = StreamCheck(PriorSettings(max_bodies=2))
     for index in range(30):
         raw = raws[index % len(raws)]
         check.see(_named(raw, skeleton) if skeleton else raw, START_NS + index * 33_000_000)

@@ -281,7 +281,7 @@ def test_a_server_that_is_late_skips_frames_and_not_bodies() -> None:
 
 
 def test_a_tracker_whose_messages_are_dropped_here_has_not_stopped(clock: VirtualClock) -> None:
-    checks = StreamChecks(8, identified=False, streams=2)
+    checks = StreamChecks(PriorSettings(), 2)
     for source in ("door", "desk"):
         checks.see(dataclasses.replace(raw(0, walking(0)), source=source), clock.time_ns)
     clock.time_ns += 3 * 10**9
@@ -290,7 +290,7 @@ def test_a_tracker_whose_messages_are_dropped_here_has_not_stopped(clock: Virtua
 
 
 def test_streams_are_examined_in_turn_and_none_is_left_out(clock: VirtualClock) -> None:
-    checks, upside_down = StreamChecks(8, identified=False, streams=10), np.array([1.0, -1.0, -1.0], np.float32)
+    checks, upside_down = StreamChecks(PriorSettings(), 10), np.array([1.0, -1.0, -1.0], np.float32)
     for k in range(45):
         clock.time_ns += FRAME_NS
         for n in range(10):
