@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import field, fields, is_dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from steadypose import PACKAGE
@@ -33,14 +32,11 @@ def launch_errors() -> Iterator[None]:
         raise LaunchError(str(error)) from error
 
 
-def path_setting(metadata: Mapping[str, Any] = MappingProxyType({}), bundled: str = "") -> Any:
-    """A field for a path. A relative path in a launch file is relative to that file.
-
-    Args:
-        metadata: further metadata of the field.
-        bundled: a folder of this package whose files can be given by name alone, see `located`.
+def path_setting(bundled: str = "") -> Any:
+    """A field for a path. A relative path in a launch file is relative to that file. Files of the package's folder
+    ``bundled`` can be given by name alone, see `located`.
     """
-    return field(default="", metadata={_PATH: bundled, **metadata})
+    return field(default="", metadata={_PATH: bundled})
 
 
 def located(name: str, folder: Path, bundled: str) -> Path:

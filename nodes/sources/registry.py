@@ -1,10 +1,11 @@
-"""Declares every source once. To add a source, write a module with its settings and class, and add one field here."""
+"""Declares every source once. To add a source, write a module with its settings and class, and
+add a field to `InputSettings` and an entry to `SOURCES`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +25,6 @@ from steadypose.nodes.sources.source import (
     WebcamSettings,
 )
 from steadypose.prior.settings import nearest
-
-_SOURCE = "source"
-
-
-@dataclass(frozen=True)
-class SourceDeclaration:
-    """One source of skeletons."""
-
-    opens: Callable[[Any, SourceContext], RecordedSource | LiveSource]
-    """creates the source from its settings; a camera is opened only when its frames are requested"""
-    extra: str
-    """the extra in `nodes.extras.EXTRAS` that it needs; empty if none"""
-
-
-def _declare(
-    opens: Callable[[Any, SourceContext], RecordedSource | LiveSource], extra: str = ""
-) -> dict[str, SourceDeclaration]:
-    """Metadata that declare a field of `InputSettings` as a source with the field's name and settings."""
-    return {_SOURCE: SourceDeclaration(opens, extra)}
 
 
 def _open_recording(path: str, context: SourceContext) -> RecordedSource:
@@ -70,12 +52,12 @@ class InputSettings:
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     tf: TfSettings = field(default_factory=TfSettings)
 
-    recording: str = path_setting(_declare(_open_recording), STREAMS)
+    recording: str = path_setting(STREAMS)
     """rosbag2 directory, .mcap, .npz or .csv to play, relative to the launch file; or the name of a bundled stream"""
-    oak: OakSettings = field(default_factory=OakSettings, metadata=_declare(open_oak, extra="oak"))
-    webcam: WebcamSettings = field(default_factory=WebcamSettings, metadata=_declare(open_webcam, extra="webcam"))
-    ros2: Ros2Settings = field(default_factory=Ros2Settings, metadata=_declare(Ros2Source))
-    merge: MergeSettings = field(default_factory=MergeSettings, metadata=_declare(MergeSource))
+    oak: OakSettings = field(default_factory=OakSettings)
+    webcam: WebcamSettings = field(default_factory=WebcamSettings)
+    ros2: Ros2Settings = field(default_factory=Ros2Settings)
+    merge: MergeSettings = field(default_factory=MergeSettings)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES and ":" not in self.source:
@@ -88,10 +70,15 @@ class InputSettings:
             raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {self.rate:g}")
 
 
-SOURCES: Mapping[str, SourceDeclaration] = {
-    setting.name: setting.metadata[_SOURCE] for setting in fields(InputSettings) if _SOURCE in setting.metadata
+SOURCES: Mapping[str, tuple[Callable[[Any, SourceContext], RecordedSource | LiveSource], str]] = {
+    "recording": (_open_recording, ""),
+    "oak": (open_oak, "oak"),
+    "webcam": (open_webcam, "webcam"),
+    "ros2": (Ros2Source, ""),
+    "merge": (MergeSource, ""),
 }
-"""Sources by name."""
+"""Of each source, what creates it from its settings, and the extra in `nodes.extras.EXTRAS` that it needs, if any. A
+camera is opened only when its frames are requested."""
 
 
 def open_input(
@@ -108,12 +95,12 @@ def open_input(
         LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
     """
     if ":" in settings.source:
-        declared, own = SourceDeclaration(load_plugin("[input] source", settings.source), ""), settings.options
+        opens, extra, own = load_plugin("[input] source", settings.source), "", settings.options
     else:
-        declared, own = SOURCES[settings.source], getattr(settings, settings.source)
-    if declared.extra:
-        require_extra(declared.extra)
-    source = declared.opens(own, SourceContext(clock, settings.calibration, keys, clear_text, image_file))
+        (opens, extra), own = SOURCES[settings.source], getattr(settings, settings.source)
+    if extra:
+        require_extra(extra)
+    source = opens(own, SourceContext(clock, settings.calibration, keys, clear_text, image_file))
     if not settings.tf.fixed_frame:
         return source
     if not isinstance(source, LiveSource):

@@ -36,14 +36,14 @@ def test_a_declaration_names_what_exists(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_a_declaration_of_a_source_names_what_exists(name: str) -> None:
-    declared, settings = SOURCES[name], getattr(InputSettings(), name)
-    assert not declared.extra or declared.extra in EXTRAS
+    (opens, extra), settings = SOURCES[name], getattr(InputSettings(), name)
+    assert not extra or extra in EXTRAS
     if name == "recording":
         assert settings == ""
     else:
         assert dataclasses.is_dataclass(settings)
         # a class, or a function that chooses one
-        assert not isinstance(declared.opens, type) or issubclass(declared.opens, LiveSource)
+        assert not isinstance(opens, type) or issubclass(opens, LiveSource)
 
 
 def test_a_node_subscribes_to_what_another_publishes() -> None:
