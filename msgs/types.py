@@ -52,6 +52,10 @@ class JointState(IntEnum):
     """not observed; inferred from the rest of the body and its motion"""
 
 
+OBSERVED = (JointState.SEEN, JointState.REFINED)
+"""States of joints that were observed."""
+
+
 class Tracking(IntEnum):
     """Whether a body's root in the world is observed or predicted."""
 

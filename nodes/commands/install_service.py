@@ -232,9 +232,7 @@ def install_service(
 
 
 def _service(launch: str, name: str, user: str) -> Service:
-    """Raises:
-    LaunchError: a service could not run so.
-    """
+    """Raises LaunchError if a service could not run so."""
     if user and not _has_user(user):
         raise LaunchError(f"--user: there is no user {user!r}; leave it out to have one made")
     file = find(launch)
@@ -266,9 +264,7 @@ def _install(service: Service) -> Iterator[Step]:
 
 
 def _undo(name: str) -> Iterator[Step]:
-    """Raises:
-    LaunchError: there is no such service, or it is somebody else's.
-    """
+    """Raises LaunchError if there is no such service, or it is somebody else's."""
     unit = _unit(name)
     if not unit.exists():
         raise LaunchError(f"there is no {unit}: nothing to remove")

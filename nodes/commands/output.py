@@ -46,9 +46,7 @@ OTHER_FORMATS = {
 
 
 def check_output(source: Path, *outputs: Path) -> None:
-    """Raises:
-    LaunchError: an output is the input, or its folder does not exist.
-    """
+    """Raises LaunchError if an output is the input, or its folder does not exist."""
     for out in outputs:
         if source.resolve() == out.resolve():
             raise LaunchError(f"{out}: expected another path than the input's; nothing is written in place")
@@ -57,9 +55,7 @@ def check_output(source: Path, *outputs: Path) -> None:
 
 
 def check_format(out: Path) -> None:
-    """Raises:
-    LaunchError: an output of poses has the ending of a format that is not one of a recording or of arrays.
-    """
+    """Raises LaunchError if an output of poses has the ending of a format that is neither a recording's nor arrays'."""
     if out.suffix in OTHER_FORMATS:
         raise LaunchError(
             f"{out}: expected .npz or .csv for arrays, or a name without ending for a recording, got {out.suffix}; "
@@ -68,9 +64,7 @@ def check_format(out: Path) -> None:
 
 
 def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bool) -> None:
-    """Raises:
-    LaunchError: a file cannot be written so: its ending is none of these, or as `check_output`; or it is there.
-    """
+    """Raises LaunchError if a file has none of these endings, or is there already; or as `check_output`."""
     check_output(source, out)
     if out.suffix not in endings:
         raise LaunchError(f"{out}: expected a name ending in {', '.join(endings)}, got {out.suffix or 'none'}")
@@ -78,18 +72,14 @@ def check_file(source: Path, out: Path, endings: tuple[str, ...], *, replace: bo
 
 
 def check_poses_file(source: Path, out: Path, *others: Path, replace: bool) -> None:
-    """Raises:
-    LaunchError: poses cannot be written to ``out``, or a file to one of the others.
-    """
+    """Raises LaunchError if poses cannot be written to ``out``, or a file to one of the others."""
     check_format(out)
     check_output(source, out, *others)
     check_replaceable(out, replace=replace, is_file=out.suffix in ARRAY_FILES)
 
 
 def check_replaceable(out: Path, *, replace: bool, is_file: bool) -> None:
-    """Raises:
-    LaunchError: something is there that is not to be replaced, or is nothing that these commands make.
-    """
+    """Raises LaunchError if what is there is not to be replaced, or is nothing that these commands make."""
     if not os.path.lexists(out):
         return
     if not replace:

@@ -64,9 +64,7 @@ def plot(
 
 
 def _refuse_folder(path: Path) -> None:
-    """Raises:
-    PlotError: the path is a folder of recordings, with which there are.
-    """
+    """Raises PlotError if the path is a folder of recordings, with which there are."""
     if path.is_dir() and not any(path.glob("*.mcap")) and (inside := sorted({f.parent for f in path.glob("*/*.mcap")})):
         names = ", ".join(str(found) for found in inside[:4])
         raise PlotError(f"{path}: expected one recording, got a folder of {len(inside)}; name one, such as {names}")

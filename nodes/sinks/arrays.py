@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import JOINTS, EventKind, JointState, Message, PoseClean, PoseWorld
+from steadypose.msgs.types import JOINTS, OBSERVED, EventKind, Message, PoseClean, PoseWorld
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.timeline import TimedEvent
 
@@ -142,7 +142,6 @@ def _slerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.
     return from_a * a + from_b * b
 
 
-OBSERVED = (JointState.SEEN, JointState.REFINED)
 _PARTS = ("x", "y", "z", "confidence", "state", "sigma")
 
 

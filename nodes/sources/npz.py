@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import (
+    OBSERVED,
     CleanBody,
-    JointState,
     Message,
     Pose,
     PoseClean,
@@ -56,7 +56,7 @@ def as_input(arrays: Arrays) -> Arrays:
     """
     if not is_output(arrays):
         return arrays
-    observed = np.isin(arrays["state"], (JointState.SEEN, JointState.REFINED))
+    observed = np.isin(arrays["state"], OBSERVED)
     positions = np.where(observed[..., None], arrays["world_positions"], np.nan)
     kept = {name: arrays[name] for name in ("stamp_ns", "body_id") if name in arrays}
     return kept | {"positions": positions, "skeleton": np.array(CANONICAL.name), "up": np.array("z")}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN
-from steadypose.msgs.types import JointState, PoseClean
+from steadypose.msgs.types import OBSERVED, PoseClean
 from steadypose.nodes.sinks.drawing import ALL_BONES, FAINT, ON_DARK, SIDES, bones
 from steadypose.nodes.sinks.plot.history import PlotError
 from steadypose.nodes.sources.adapters import pinhole
@@ -77,7 +77,7 @@ def _of_recording(path: Path, body: int | None) -> dict[int, list[Body]]:
         for _, stamp_ns, message in reader.messages([POSE_CLEAN]):
             if isinstance(message, PoseClean):
                 moments[stamp_ns] = [
-                    Body(found.raw_positions, found.positions, _observed(found.state))
+                    Body(found.raw_positions, found.positions, np.isin(found.state, OBSERVED))
                     for found in message.bodies
                     if body in (None, found.id)
                 ]
@@ -94,13 +94,9 @@ def _of_npz(path: Path, body: int | None) -> dict[int, list[Body]]:
     )
     chosen = [n for n, id in enumerate(arrays["body_id"] if several else [0]) if body in (None, id)]
     return {
-        int(stamp_ns): [Body(None, clean[row, n], _observed(state[row, n])) for n in chosen]
+        int(stamp_ns): [Body(None, clean[row, n], np.isin(state[row, n], OBSERVED)) for n in chosen]
         for row, stamp_ns in enumerate(arrays["stamp_ns"])
     }
-
-
-def _observed(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    return np.isin(state, (JointState.SEEN, JointState.REFINED))
 
 
 def _frames(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import JointState
+from steadypose.msgs.types import OBSERVED
 from steadypose.nodes.extras import how_to_install
 from steadypose.nodes.sinks.drawing import (
     ALL_BONES,
@@ -202,7 +202,7 @@ def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) 
 def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
     opacity = np.ones(len(shown))
     if track.state.size:
-        observed = np.isin(track.state[row], (JointState.SEEN, JointState.REFINED))
+        observed = np.isin(track.state[row], OBSERVED)
         opacity = np.where(observed[shown].all(axis=1), 1.0, FAINT)
     draw_bones(ax, view(track.positions[row]), shown, _sides(shown), width=3.0, alpha=opacity)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_TRUTH
 from steadypose.msgs.types import (
+    OBSERVED,
     CleanBody,
     Diagnostics,
     JointState,
@@ -60,8 +61,6 @@ BACK_JUMP_NS = 1_000_000_000
 
 MOST_IMAGES = 30
 """Largest number of images that wait for their poses; two seconds of images."""
-
-OBSERVED = (JointState.SEEN, JointState.REFINED)
 
 _TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
