@@ -21,6 +21,7 @@ RECIPES = {
     "hmvae": ("hmvae", "train_hmvae"),
     "hmvae64": ("hmvae", "train_long_hmvae"),
     "hgvae": ("hgvae", "train_hgvae"),
+    "completion": ("hgvae", "train_completion"),
     "trajectory": ("root_velocity", "train_trajectory"),
     "contacts": ("contacts", "train_contacts"),
     "completer": ("completer", "train_completer"),
@@ -66,9 +67,10 @@ def train(
 
     Args:
         model: mixture (the smoother), body_modes (which joints it smooths together; takes seconds), hmvae (refinement),
-            hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), trajectory (root velocity),
-            contacts, humor (transitions, for 'steadypose fit'), occlusion (weights of a hidden joint), posture
-            (relative position of joints), completer ('steadypose complete'), or correction (bias of a sensor).
+            hmvae64 ('complete --optimise'), hgvae (anomaly score and imputation), completion (the part of hgvae that
+            places hidden joints), trajectory (root velocity), contacts, humor (transitions, for 'steadypose fit'),
+            occlusion (weights of a hidden joint), posture (relative position of joints), completer ('steadypose
+            complete'), or correction (bias of a sensor).
         data: output of 'steadypose prepare'. For a correction, ui_prmd.npz (Kinect beside Vicon). For mixture,
             body_modes and occlusion, the folder of the recordings, which are played at several speeds.
         weights: the weight set to train: 'default' uses only data licensed for products, 'research' all data (not for

@@ -7,10 +7,12 @@ different deviations, so that the reverse divergence is another number.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from tests.prior.models.test_hgvae import SMALL
 from torch import Tensor, nn
 
@@ -18,9 +20,12 @@ from steadypose.benchmarks.motion import as_set, simulated_clips
 from steadypose.prior.fit.hmvae_network import HMVAE
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.humor_state import State
+from steadypose.prior.models.hgvae.faults import Calibration, LiveFaultNet
 from steadypose.prior.models.hmvae import HMVAEConfig
+from steadypose.prior.models.weights import weights_path
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.hgvae_windows import Windows
+from steadypose.training.loop import TrainingOptions
 from steadypose.training.networks.hgvae import HGVAE
 from steadypose.training.recipes import hgvae, hmvae
 from steadypose.training.recipes.humor import Batch, Sequences, transition_loss
@@ -148,3 +153,18 @@ def test_hgvaes_kl_counts_in_full_after_a_fifth_of_the_training(motion: MotionSe
     start = value(loss, 0.0)[0] - 0.001 * nats
     for done, beta in ((0.1, 0.5005), (0.2, 1.0), (0.9, 1.0)):
         assert value(loss, done)[0] - start == pytest.approx(beta * nats, rel=1e-3)
+
+
+def test_the_completion_network_alone_is_trained_within_weights_that_ship(tmp_path: Path) -> None:
+    motion = as_set(simulated_clips(120, 4, seed=0))
+
+    class Simulated(TrainingOptions):
+        def motion(self, *, flat: bool = False) -> tuple[MotionSet, MotionSet]:
+            return motion, motion
+
+    path = hgvae.train_completion(Simulated(tmp_path, tmp_path, iterations=1))
+    before, after = (load_file(file) for file in (weights_path("default", "hgvae"), path))
+    changed = {name.partition(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"completion"}
+    Calibration.load(str(path))
+    LiveFaultNet.load(str(path), 1)

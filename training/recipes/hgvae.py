@@ -9,6 +9,7 @@ at the posterior means. One pass then denoises and completes a window, with a st
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -49,7 +50,11 @@ BONE_SIGMA, TURN_SIGMA = 0.05, 0.2
 radians. There are only 22 people to train on."""
 
 
-def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[CompletionNet]:
+COMPLETION_RATE = 2e-3
+"""Initial learning rate of the completion network; half of it if it starts from trained weights."""
+
+
+def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -> Recipe[CompletionNet]:
     """Return the recipe of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries; the
     model's ``mean`` is set.
 
@@ -70,7 +75,7 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows) -> Recipe[Comp
 
     return Recipe(
         "hgvae", lambda: network, loss_of, lambda _: evaluate_completion(model, val), ITERATIONS, COMPLETION_BATCH,
-        rate=2e-3, decay=1e-3, schedule=CosineAnnealingLR, evaluations=20,
+        rate, decay=1e-3, schedule=CosineAnnealingLR, evaluations=20,
     )  # fmt: skip
 
 
@@ -147,7 +152,7 @@ def train_hgvae(options: TrainingOptions) -> Path:
     network = HGVAE(CONFIG)
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, "hgvae", start)
-    completion = completion_recipe(network, train, val)
+    completion = completion_recipe(network, train, val, COMPLETION_RATE)
     completion.minimise(_network(network), options.runs / f"{path.stem}-completion", iterations, seed)
     recipe = recipe_of(train, val, RATE if start is None else RATE / 2)
     run = recipe.minimise(network, path.parent, iterations, seed)
@@ -161,6 +166,33 @@ def train_hgvae(options: TrainingOptions) -> Path:
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, "hgvae").with_suffix(".faults.safetensors"))
     train_anomaly(path, -(-iterations // 3), replace(options, start=faults))
+    return path
+
+
+def train_completion(options: TrainingOptions) -> Path:
+    """Train the completion network alone, within the weights ``options.start`` or those that ship.
+
+    The fault network and the calibration of the anomaly score are copied: they are about observed joints.
+
+    Returns:
+        The path of the weights.
+    """
+    start, path = options.start or options.weights, options.path("hgvae")
+    train, val = (Windows(motion) for motion in options.motion())
+    network = HGVAE(CONFIG)
+    origin = started(network, "hgvae", start)
+    recipe = completion_recipe(network, train, val, COMPLETION_RATE / 2)
+    iterations = options.iterations or ITERATIONS
+    run = recipe.minimise(_network(network), path.parent, iterations, options.seed)
+    for suffix in (".anomaly.json", ".faults.safetensors"):
+        shutil.copyfile(weights_path(start, "hgvae").with_suffix(suffix), path.with_suffix(suffix))
+    run.save(path, network, asdict(network.config), {
+        "Model": "HG-VAE, of training/recipes/hgvae.py",
+        "Data": f"the '{options.weights}' set of `steadypose prepare`, split by subject",
+        "Licence": LICENCES[options.weights],
+        "Training": f"`steadypose train completion --weights {options.weights}`: {iterations} steps of {recipe.batch} "
+        f"windows, of its completion network alone, AdamW {recipe.rate:g}, seed {options.seed}{origin}",
+    })  # fmt: skip
     return path
 
 
