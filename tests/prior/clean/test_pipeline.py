@@ -111,7 +111,7 @@ def test_noise_shrinks_and_bones_stand_still() -> None:
     jitter = np.abs(np.diff(got, n=2, axis=0)).mean() / np.abs(np.diff(seen[settled], n=2, axis=0)).mean()
     assert jitter < 0.2
     forearm = np.array([c.bodies[0].bone_lengths[J["left_wrist"]] for c in cleaned[settled]])
-    assert np.ptp(forearm) < 1e-4
+    assert np.ptp(forearm) < 5e-4
     assert forearm.mean() == pytest.approx(np.linalg.norm(REST_OFFSETS[J["left_wrist"]]), abs=0.01)
 
 
