@@ -85,20 +85,6 @@ def test_bones_are_recovered_from_noisy_poses() -> None:
     assert np.abs(error[1:]).max() < 0.012
 
 
-def test_bones_between_joints_that_are_never_seen_span_the_gap() -> None:
-    bones = REST_OFFSETS * 1.1
-    positions = fk(random_pose(np.random.default_rng(7), 50, spread=0.1), bones)
-    unseen = [J["spine1"], J["spine2"], J["left_collar"], J["right_collar"]]
-    positions[:, unseen] = np.nan
-    estimate = estimate_offsets(positions)
-    chain = [J["spine1"], J["spine2"], J["spine3"]]
-    assert np.linalg.norm(estimate[chain].sum(axis=0)) == pytest.approx(
-        np.linalg.norm(bones[chain].sum(axis=0)), rel=0.02
-    )
-    placed = solve_pose(positions, estimate)[1]
-    assert np.nanmedian(np.linalg.norm(placed - positions, axis=-1)[:, J["left_shoulder"]]) < 0.01
-
-
 def test_a_bent_limb_does_not_shorten_bones_around_a_joint_that_is_never_seen() -> None:
     """Arms hang from the shoulders, and a knee is straight now and then."""
     arm, leg = [J["left_shoulder"], J["left_elbow"]], [J["left_knee"], J["left_ankle"]]
