@@ -128,7 +128,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         cleaned = [part for frame in self._core.flush() for part in self._split(frame)]
         for name, stream in list(self._streams.items()):
             if stream.last.end_of_stream:
-                cleaned.append(end_of_stream(stream.last, self.delay_frames))
+                cleaned.append(self._end(stream))
             self._forget(name)
         self._drop(np.ones_like(self._slots.present))
         self._waiting.clear()
@@ -245,7 +245,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             if not 0 <= stream.first_ns <= stamp_ns + 1000:
                 continue
             if stream.last.end_of_stream and stream.newest_ns < stamp_ns - 1000:
-                cleaned.append(end_of_stream(stream.last, self.delay_frames))
+                cleaned.append(self._end(stream))
                 self._forget(name)
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
@@ -256,6 +256,12 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             cleaned.append(clean_message(raw, own_ns, self.delay_frames, list(bodies.values())))
         self._core.note_published(frame, published)
         return cleaned
+
+    def _end(self, stream: _Stream) -> PoseClean:
+        """A stream's last message, not before its last frame: the grid's may lie after the last that was captured."""
+        own_ns = stream.newest_ns - round(stream.offset_ns)
+        last = dataclasses.replace(stream.last, stamp_ns=max(stream.last.stamp_ns, own_ns))
+        return end_of_stream(last, self.delay_frames)
 
     def _forget(self, name: str) -> None:
         """Forget a stream."""

@@ -129,6 +129,16 @@ def test_frames_at_any_time_and_a_clock_that_drifts() -> None:
         assert all(len(c.bodies) == 1 for c in answers[name])
 
 
+@pytest.mark.parametrize("phase_ms", [21, 27])
+def test_a_stream_ends_no_earlier_than_its_last_frame(phase_ms: int) -> None:
+    """Also if the grid's last time is after that of the last frame."""
+    first, last = kiosk("first", 20, phase_ns=phase_ms * 10**6), kiosk("last", 30, phase_ns=phase_ms * 10**6)
+    answers, _ = serve([*first, end(first)], [*last, end(last)])
+    for clean in answers.values():
+        assert clean[-1].end_of_stream
+        assert np.diff([c.stamp_ns for c in clean]).min() >= -1
+
+
 def test_who_is_late_holds_up_nobody() -> None:
     prompt = kiosk("prompt", 60)
     slow = kiosk("slower", 60)
