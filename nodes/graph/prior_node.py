@@ -58,6 +58,7 @@ class PriorNode(Node):
         self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
         self._started_ns = self.clock.now_ns()
         self._limit = BodyLimit(settings.max_bodies, self.clock)
+        self._optional = [stage for stage in ("score", "impute") if getattr(settings, stage).enabled]
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseRaw):
@@ -103,10 +104,11 @@ class PriorNode(Node):
 
     def _overload(self) -> Iterator[Problem]:
         if self._limit.bodies < self._pipeline.offered:
+            stages = " and ".join(f"[prior.{stage}]" for stage in self._optional)
             yield warning(
                 "overload",
                 f"this machine has time for {self._limit.bodies} of {self._pipeline.offered} bodies: those farthest "
-                "from the sensor are left out; switch off [prior.score] and [prior.impute], or use a faster machine",
+                f"from the sensor are left out; {f'switch off {stages}, or ' if stages else ''}use a faster machine",
             )
 
     def status(self) -> dict[str, str]:

@@ -28,6 +28,7 @@ from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
+from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import IdentifySettings, PriorSettings
 
 SECOND_NS = 1_000_000_000
@@ -291,6 +292,20 @@ class TestNode:
         news = self.play(node, clock, walk())
         assert news.level == Level.OK
         assert not from_values(news.values)
+
+    @pytest.mark.parametrize(("off", "told"), [((), "[prior.score] and [prior.impute]"), (("score", "impute"), "")])
+    def test_overload_names_the_stages_that_are_on(
+        self,
+        make_launch: Callable[..., Launch],
+        clock: VirtualClock,
+        monkeypatch: pytest.MonkeyPatch,
+        off: tuple[str, ...],
+        told: str,
+    ) -> None:
+        monkeypatch.setattr(PriorPipeline, "offered", 100)
+        settings = {f"prior.{stage}.enabled": "false" for stage in off}
+        (problem,) = PriorNode(make_launch(settings, nodes='["prior"]'), clock).problems()
+        assert problem.text.endswith(f"left out; {f'switch off {told}, or ' if told else ''}use a faster machine")
 
     @pytest.mark.parametrize("rate", [0, 1])
     def test_as_fast_as_possible_stamps_and_clock_part(self, make_launch, clock: VirtualClock, rate: int) -> None:
