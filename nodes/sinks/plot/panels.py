@@ -204,7 +204,8 @@ def _draw_intervals(ax: Axes, history: History) -> None:
             ax.plot(
                 stamps[1:], np.diff(stamps) * 1e3, ".", color=colour, markersize=3, label=topic.removeprefix("pose/")
             )
-    ax.legend(loc="upper right", ncols=3, fontsize=7, markerscale=3)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="upper right", ncols=3, fontsize=7, markerscale=3)
     ax.set_yscale("log")
     ax.set_yticks([10, 30, 100, 300, 1000], ["10", "30", "100", "300", "1000"])
     ax.minorticks_off()

@@ -61,9 +61,9 @@ def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("frames", [1, 2])
-def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, frames: int) -> None:
-    assert drawn(record(tmp_path / "bag", (4 + frames) / 30))
+@pytest.mark.parametrize(("raw", "topics"), [(1, {POSE_RAW}), (5, EVERY), (6, EVERY)])
+def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, raw: int, topics: set[str]) -> None:
+    assert drawn(record(tmp_path / "bag", raw / 30, topics))
 
 
 @pytest.mark.filterwarnings("error")
