@@ -275,7 +275,9 @@ class Rate:
     @property
     def brief(self) -> str:
         """In a few words, to follow the number of messages."""
-        return f", {self.mean_hz:.2f} Hz, longest gap {self.longest_s * 1e3:.0f} ms" if self.count > 1 else ""
+        if np.isnan(self.mean_hz):  # fewer than two, or all of one stamp
+            return ""
+        return f", {self.mean_hz:.2f} Hz, longest gap {self.longest_s * 1e3:.0f} ms"
 
     def __str__(self) -> str:
         return (

@@ -113,6 +113,7 @@ def test_rate_of_uneven_times() -> None:
     assert (rate.shortest_s, rate.longest_s) == (pytest.approx(0.1), pytest.approx(0.3))
     assert rate.deviation_s == pytest.approx(np.std([0.1, 0.1, 0.3]))
     assert np.isnan(Rate([1.0]).mean_hz)
+    assert not Rate([1.0, 1.0]).brief, "a frame and the end of its stream"
 
 
 def test_measuring_tells_once_a_second_and_looks_back_no_further_than_the_window() -> None:
