@@ -40,7 +40,7 @@ class BodyJoints(NamedTuple):
     """(22,) or (S, 22) in 0..1"""
 
 
-class Lately(deque[PoseRaw]):
+class RecentMessages(deque[PoseRaw]):
     """Messages of a stream since the frame that is to be published next, oldest first."""
 
     def at(self, stamp_ns: int) -> PoseRaw:

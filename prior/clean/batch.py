@@ -19,7 +19,14 @@ import numpy as np
 from steadypose.msgs.types import PoseClean, PoseRaw
 from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import Skeleton
-from steadypose.prior.clean.adapt import BodyJoints, Lately, clean_bodies, clean_message, end_of_stream, layout_of
+from steadypose.prior.clean.adapt import (
+    BodyJoints,
+    RecentMessages,
+    clean_bodies,
+    clean_message,
+    end_of_stream,
+    layout_of,
+)
 from steadypose.prior.clean.admission import SLOWEST_NS, SensorPoseGate, StampGate, Verdict
 from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.clean.identify import Identify
@@ -44,7 +51,7 @@ class _Stream:
     resampler: Resampler  # to the shared grid; its slots are those of the batch
     identify: Identify | None  # None if the source assigns ids to its bodies
     offset_ns: float  # from its clock to the server's
-    lately: Lately
+    recent: RecentMessages
     sensor_pose: SensorPoseGate
     time_ns: int = -1  # capture time of the newest message
     heard_ns: int = -1  # arrival time of the newest message
@@ -55,7 +62,7 @@ class _Stream:
     @property
     def last(self) -> PoseRaw:
         """Its newest message."""
-        return self.lately[-1]
+        return self.recent[-1]
 
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):
@@ -112,7 +119,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         if raw.end_of_stream:
             if stream:
                 # only the sensor's pose of the last message is used, and the pose of this one was not checked
-                stream.lately.append(dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose))
+                stream.recent.append(dataclasses.replace(raw, sensor_pose=stream.last.sensor_pose))
                 stream.heard_ns = now_ns
         else:
             layout = layout_of(raw, self.counters)
@@ -168,7 +175,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 resampler=Resampler(self._settings.max_bodies, aligned=True, delayed=self._settings.delay > 0),
                 identify=self._new_identify(),
                 offset_ns=now_ns - raw.stamp_ns,
-                lately=Lately(),
+                recent=RecentMessages(),
                 sensor_pose=SensorPoseGate(),
                 heard_ns=now_ns,
             )
@@ -180,7 +187,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self.counters["stamp_out_of_order"] += 1
             stream.late += 1
             return
-        stream.lately.append(raw)
+        stream.recent.append(raw)
         stream.time_ns = time_ns
         # levelled, with the sensor at the origin, because the streams share no world frame
         sensor = SensorFrame.of(raw.sensor_pose).levelled()
@@ -250,7 +257,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
             own_ns = max(stamp_ns - round(stream.offset_ns), 0)
-            raw = stream.lately.at(own_ns)
+            raw = stream.recent.at(own_ns)
             bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose).levelled(), ids)
             published |= bodies.keys()
             cleaned.append(clean_message(raw, own_ns, self.delay_frames, list(bodies.values())))

@@ -17,7 +17,7 @@ from steadypose.prior.body.layouts import CANONICAL, Skeleton
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.adapt import (
     BodyJoints,
-    Lately,
+    RecentMessages,
     canonical_bodies,
     clean_bodies,
     clean_message,
@@ -133,7 +133,7 @@ class PriorPipeline(BodyPipeline[int]):
         self._resampler = Resampler(settings.max_bodies, delayed=settings.delay > 0)
         self._stamps = StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
         self._sensor_pose = SensorPoseGate()
-        self._lately = Lately()
+        self._recent = RecentMessages()
 
     def process(self, raw: PoseRaw, *, gap: bool = False) -> list[PoseClean]:
         """Process a ``pose/raw`` message and return the ``pose/clean`` messages that it completes, oldest first.
@@ -156,8 +156,8 @@ class PriorPipeline(BodyPipeline[int]):
         if layout is None:
             return []
         flushed: list[PoseClean] = []
-        if self._lately:
-            step = raw.stamp_ns - self._lately[-1].stamp_ns
+        if self._recent:
+            step = raw.stamp_ns - self._recent[-1].stamp_ns
             if -BACKWARDS_NS < step <= 0:
                 self.counters["stamp_repeated" if step == 0 else "stamp_out_of_order"] += 1
                 return []
@@ -174,9 +174,9 @@ class PriorPipeline(BodyPipeline[int]):
             self.counters["sensor_moved"] += 1
             flushed += self._flush()
             self._sensor_pose.judge(raw.sensor_pose, raw.stamp_ns)
-        if not self._lately:
+        if not self._recent:
             self._origin_ns = raw.stamp_ns
-        self._lately.append(raw)
+        self._recent.append(raw)
         joints = self._arranged(raw, layout, SensorFrame.of(raw.sensor_pose), self._identify, int)
         ticks = self._resampler.update(raw.stamp_ns, *joints)
         if gap and len(ticks) > CATCH_UP:
@@ -191,18 +191,18 @@ class PriorPipeline(BodyPipeline[int]):
 
     def _flush(self) -> list[PoseClean]:
         cleaned: list[PoseClean] = []
-        if self._lately:
+        if self._recent:
             cleaned += self._stepped(self._resampler.drain())
             cleaned += [self._message(frame) for frame in self._core.flush()]
         self._drop(np.ones_like(self._slots.present))
         self._resampler.reset()
         self._sensor_pose.reset()
-        self._lately.clear()
+        self._recent.clear()
         return cleaned
 
     def _stepped(self, ticks: list[Frame]) -> list[PoseClean]:
         """Process frames of the 30 Hz grid and return the messages that they complete."""
-        origin = SensorFrame.of(self._lately[-1].sensor_pose).origin
+        origin = SensorFrame.of(self._recent[-1].sensor_pose).origin
         frames = (self._advance_to(stamp_ns, BodyJoints(*joints), origin) for stamp_ns, *joints in ticks)
         return [self._message(frame) for frame in frames if frame is not None]
 
@@ -212,7 +212,7 @@ class PriorPipeline(BodyPipeline[int]):
     def _message(self, frame: CleanFrame) -> PoseClean:
         """Build the output message, in the sensor's frame at the time of the frame."""
         stamp_ns = self._origin_ns + round(frame.estimate.stamp_s * 1e9)
-        raw = self._lately.at(stamp_ns)
+        raw = self._recent.at(stamp_ns)
         ids = {slot: key for slot, key in enumerate(self._slots.keys) if key is not None}
         bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose), ids)
         self._core.note_published(frame, bodies)
