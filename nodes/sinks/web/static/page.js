@@ -57,7 +57,7 @@ pose.on("health", ({ node, level, message, values }) => {
 });
 
 function label({ kind, hand }) {
-  const words = kind.toLowerCase().replaceAll("_", " ");
+  const words = kind === "LEFT" ? "is gone" : kind.toLowerCase().replaceAll("_", " ");  // left is also a side
   return hand === "NONE" ? words : `${hand.toLowerCase()} ${words}`;
 }
 
