@@ -9,8 +9,6 @@ STALE = {
     **dict.fromkeys(
         (
             "ablations",
-            "completion",
-            "counter",
             "humor",
             "kinect_vicon",
             "latency",
