@@ -10,9 +10,7 @@ STALE = {
         (
             "humor",
             "kinect_vicon",
-            "latency",
             "restart",
-            "retarget",
             "rotations",
             "scale",
         ),
