@@ -17,6 +17,7 @@ import threading
 from collections import deque
 from collections.abc import Collection
 from concurrent.futures import Future
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -113,13 +114,17 @@ class WebServer:
             await self._closing.wait()
 
     async def _talk(self, connection: ServerConnection) -> None:
+        from websockets.exceptions import ConnectionClosed
+
         client = _Client()
         for stream, text in self._latest.items():
             client.offer(stream, text, True)
         self._clients.add(client)
         feeding = asyncio.create_task(_feed(connection, client, self._greeting))
         try:
-            await connection.wait_closed()
+            with suppress(ConnectionClosed):
+                while True:  # what a client sends is discarded, but read: behind it are pongs and the close frame
+                    await connection.recv(decode=False)
         finally:
             self._clients.remove(client)
             feeding.cancel()

@@ -131,6 +131,14 @@ def test_there_are_no_more_clients_than_there_is_room_for(server: WebServer) -> 
     until(lambda: server.clients == 0)
 
 
+def test_a_client_may_send_what_it_likes_and_leave(server: WebServer) -> None:
+    with client(server) as it:
+        for _ in range(300):
+            it.send("x" * 1000)
+        assert it.ping().wait(20)  # the pong comes after what was sent was read
+    until(lambda: server.clients == 0)
+
+
 def test_a_port_that_is_taken_is_named(server: WebServer) -> None:
     with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 is not to be had"):
         WebServer("127.0.0.1", server.port, [], TOKEN, hello())
