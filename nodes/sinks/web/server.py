@@ -21,7 +21,7 @@ from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.serving import called, is_token, own_names, port_taken, shown
@@ -132,19 +132,19 @@ class WebServer:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The response to a request; None upgrades it to a WebSocket."""
-        host = request.headers.get("Host", "")
+        host = ", ".join(request.headers.get_all("Host"))
         own = called(host, self._names)
         if own is None:
             return connection.respond(
                 HTTPStatus.MISDIRECTED_REQUEST,
                 f"not served under the name {host!r}: add it to [web] names if browsers reach this machine by it\n",
             )
-        url = urlsplit(request.path)
-        if url.path == "/ws":
-            return self._admit(connection, parse_qs(url.query).get("token", [""])[0])
-        if url.path not in FILES:
+        path, _, query = request.path.partition("?")
+        if path == "/ws":
+            return self._admit(connection, parse_qs(query).get("token", [""])[0])
+        if path not in FILES:
             return connection.respond(HTTPStatus.NOT_FOUND, f"there are {', '.join(FILES)}, and the WebSocket /ws\n")
-        return _file(FILES[url.path], own)
+        return _file(FILES[path], own)
 
     def _admit(self, connection: ServerConnection, token: str) -> Response | None:
         if not is_token(token, self._token):

@@ -1,5 +1,6 @@
 import http.client
 import json
+import socket
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -57,7 +58,9 @@ def test_pages_are_served_and_may_load_nothing_from_elsewhere(server: WebServer)
     assert "Access-Control-Allow-Origin" not in get(server, "/")[1]
 
 
-@pytest.mark.parametrize("path", ["/../settings.py", "/static/index.html", "//etc/passwd", "/%2e%2e/form.py", "/wsx"])
+@pytest.mark.parametrize(
+    "path", ["/../settings.py", "/static/index.html", "//etc/passwd", "/%2e%2e/form.py", "/wsx", "//["]
+)
 def test_nothing_else_is_served(server: WebServer, path: str) -> None:
     assert get(server, path)[0] == 404
 
@@ -73,6 +76,12 @@ def test_names_of_its_own_are_answered(server: WebServer, host: str) -> None:
 @pytest.mark.parametrize("path", ["/", f"/ws?token={TOKEN}"])
 def test_names_that_others_have_pointed_here_are_not(server: WebServer, path: str, host: str) -> None:
     assert get(server, path, host)[0] == 421
+
+
+def test_a_request_that_names_two_hosts_is_refused(server: WebServer) -> None:
+    with socket.create_connection(("127.0.0.1", server.port), 20) as it:
+        it.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n")
+        assert it.recv(100).startswith(b"HTTP/1.1 421")
 
 
 @pytest.mark.parametrize("token", ["", "wrong", TOKEN[:-1], TOKEN + "x", "%ff"])
