@@ -109,11 +109,9 @@ class WebNode(Node):
 
 def kept_token(file: Path) -> str:
     """The token in a file that only this user can read; created on first use."""
-    try:
-        made = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError:
-        return file.read_text()
-    with open(made, "w") as new:
+    if file.exists() and (kept := file.read_text()):  # it is empty if the disk was full
+        return kept
+    with open(os.open(file, os.O_WRONLY | os.O_CREAT, 0o600), "w") as new:
         new.write(token := secrets.token_urlsafe(24))
     return token
 

@@ -181,6 +181,12 @@ def test_the_token_is_kept_where_only_this_user_reads(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
 
 
+def test_a_token_that_found_no_room_on_the_disk_is_drawn_again(tmp_path: Path) -> None:
+    (tmp_path / "token").touch()
+    assert len(token := kept_token(tmp_path / "token")) >= 32
+    assert kept_token(tmp_path / "token") == token
+
+
 def test_the_node_serves_what_the_others_publish(make_launch: Callable[..., Launch]) -> None:
     worlds = [message for topic, message in messages(1.0) if topic == POSE_WORLD]
     launch = make_launch(nodes='["trajectory", "events", "web"]', web__port="0", transport__lossless="false")
