@@ -58,6 +58,9 @@ class _Node:
     channels: tuple[str, ...] = ()
 
 
+AT_ONCE = 256
+"""Number of frames that are read or computed at once: words and rotations take ten times the memory of positions."""
+
 _POSITION = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
 _ROTATION = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
 _WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)")
@@ -91,19 +94,23 @@ class Bvh:
             joint = self.joints.index(name)
             if not offsets[joint].any():
                 offsets[joint] = multiple * offsets[self.parents[joint]]
-        steps = np.tile(offsets, (len(self.values), 1, 1))
+        parts = [self._placed(offsets, self.values[k : k + AT_ONCE]) for k in range(0, len(self.values), AT_ONCE)]
+        return np.concatenate([np.empty((0, *offsets.shape)), *parts])
+
+    def _placed(self, offsets: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        steps = np.tile(offsets, (len(values), 1, 1))
         local = np.broadcast_to(np.eye(3), (*steps.shape, 3)).copy()
         column = 0
         for j, channels in enumerate(self.channels):
             order = "".join(_ROTATION[c] for c in channels if c in _ROTATION)
             if order:
                 turning = [column + i for i, c in enumerate(channels) if c in _ROTATION]
-                local[:, j] = Rotation.from_euler(order, self.values[:, turning], degrees=True).as_matrix()
+                local[:, j] = Rotation.from_euler(order, values[:, turning], degrees=True).as_matrix()
             for i, channel in enumerate(channels):
                 if channel in _POSITION:
                     axis = _POSITION[channel]
                     base = offsets[j, axis] if self.parents[j] < 0 else 0.0
-                    steps[:, j, axis] = base + self.values[:, column + i]
+                    steps[:, j, axis] = base + values[:, column + i]
             column += len(channels)
         return forward(self.parents, steps, local)[0]
 
@@ -179,6 +186,13 @@ def _hierarchy(text: str) -> list[_Node]:
     return nodes
 
 
+def _numbers(text: str) -> NDArray[np.float64]:
+    """All numbers of a text, a few lines at a time."""
+    lines = text.splitlines()
+    parts = (lines[k : k + AT_ONCE] for k in range(0, len(lines), AT_ONCE))
+    return np.concatenate([np.array(" ".join(part).split(), np.float64) for part in parts])
+
+
 def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], float]:
     """Return values (T, channels), and frames per second. ``last`` is the number of the file's last line."""
     words = text.split(maxsplit=5)
@@ -186,7 +200,7 @@ def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], f
         raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
     try:
         frames, seconds = int(words[1]), float(words[4])
-        values = np.array(words[5].split() if len(words) > 5 else [], dtype=np.float64)
+        values = _numbers(words[5]) if len(words) > 5 else np.empty(0)
     except ValueError as error:
         raise MotionError(f"a number in the motion cannot be read: {error}") from error
     if seconds <= 0:

@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -37,6 +39,19 @@ def test_a_bvh_is_turned_joint_by_joint(order: list[str], frames: list[tuple[lis
         arm_at = hip_at + root @ [shift[4], shift[5], shift[3]]  # elsewhere, in the offset's place
         expected = [hip_at, arm_at, arm_at + arm @ [0.3, 0, 0], arm_at + arm @ [0, 0, 0.2]]
         np.testing.assert_allclose(got, expected, atol=1e-6)
+
+
+def test_a_long_bvh_takes_no_more_memory_than_a_few_copies_of_its_text_and_of_its_positions() -> None:
+    text = bvh_text(frames=[[float(k % 90)] * 12 for k in range(4000)])
+    tracemalloc.start()
+    bvh = read_bvh(text)
+    read = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    positions = bvh.positions()
+    computed = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert read < 7 * len(text)  # of all words at once: 9.8
+    assert computed < 2 * (bvh.values.nbytes + 2 * positions.nbytes)  # of all rotations at once: 3.3
 
 
 def test_a_bone_that_the_converter_lost_is_put_back_only_where_it_is_lost() -> None:
