@@ -48,6 +48,8 @@ class PartInfo:
     """number of messages by topic"""
     first_ns: int = 2**63 - 1
     last_ns: int = 0
+    first_of: dict[str, int] = field(default_factory=dict)
+    """log time of each topic's first message, nanoseconds"""
 
     @classmethod
     def of(cls, path: Path) -> PartInfo:
@@ -116,7 +118,7 @@ class RecordingWriter(Closing):
         payload = encode(message)
         if (topic, payload) in self._tail:
             return
-        if self._part.broken or self._is_full(stamp_ns):
+        if self._part.broken or self._is_full(topic, stamp_ns):
             self.split()
         self._part.write(topic, payload, stamp_ns)
 
@@ -139,11 +141,12 @@ class RecordingWriter(Closing):
         self._finish()
         self._part = _Part(self.directory, self._part.number + 1)
 
-    def _is_full(self, stamp_ns: int) -> bool:
+    def _is_full(self, topic: str, stamp_ns: int) -> bool:
         info = self._part.info
         if not info.counts:
             return False
-        span_ns = max(stamp_ns, info.last_ns) - info.first_ns
+        # of one topic, because a wrong stamp of one would make the span of all too long in every part
+        span_ns = stamp_ns - info.first_of.get(topic, stamp_ns)
         return 0 < self._split_bytes <= self._part.size or 0 < self._split_ns <= span_ns
 
     def close(self) -> None:
@@ -238,6 +241,7 @@ class _Part:
                 channel, log_time=stamp_ns, publish_time=stamp_ns, data=payload, sequence=info.counts[topic]
             )
             info.counts[topic] += 1
+            info.first_of.setdefault(topic, stamp_ns)
             info.first_ns = min(info.first_ns, stamp_ns)
             info.last_ns = max(info.last_ns, stamp_ns)
             self._written[topic] = stamp_ns

@@ -444,6 +444,14 @@ def test_parts_are_split_by_size_and_by_time(limits: dict[str, Any], tmp_path: P
         assert bag.message_count == len(stream())
 
 
+def test_a_topic_of_another_time_splits_no_part(tmp_path: Path):
+    """As after one wrong stamp: the recorder's log times do not go back."""
+    far_ns = START_NS + 10**18
+    messages = [(topic, far_ns if topic == POSE_RAW else stamp_ns, m) for topic, stamp_ns, m in stream()]
+    record(tmp_path / "recording", messages, split_ns=3600 * 10**9)
+    assert len(list((tmp_path / "recording").glob("*.mcap"))) == 1
+
+
 def test_the_oldest_parts_go_where_there_is_a_limit(tmp_path: Path):
     directory = tmp_path / "recording"
     record(directory, stream(), split_bytes=50_000, keep_bytes=200_000)
