@@ -120,18 +120,29 @@ def _is_recording(directory: Path) -> bool:
     return True
 
 
+AHEAD_NS = 10_000_000_000
+"""Jump ahead of a topic's stamps of which a single one counts as wrong, nanoseconds."""
+
+
 class LogTimes:
     """Assigns MCAP log times with which a recording plays in the order of arrival.
 
-    The log time is the capture stamp or, if a topic's stamps went back, the highest stamp before.
+    The log time is the capture stamp or, if a topic's stamps went back, the highest stamp before. A single wrong stamp,
+    far ahead, does not count, because all later messages would have its log time.
     """
 
     def __init__(self) -> None:
         self._highest_ns: dict[str, int] = {}
+        self._ahead: set[str] = set()  # topics whose last stamp was far ahead
 
     def next(self, topic: str, stamp_ns: int) -> int:
         """Log time of the topic's next message, captured at ``stamp_ns``; nanoseconds."""
-        self._highest_ns[topic] = max(stamp_ns, self._highest_ns.get(topic, 0))
+        highest_ns = self._highest_ns.get(topic, stamp_ns)
+        if stamp_ns - highest_ns > AHEAD_NS and topic not in self._ahead:
+            self._ahead.add(topic)
+            return highest_ns
+        self._ahead.discard(topic)
+        self._highest_ns[topic] = max(stamp_ns, highest_ns)
         return self._highest_ns[topic]
 
 

@@ -11,7 +11,7 @@ from conftest import VirtualClock, walk
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.nodes.graph.launch import Launch
-from steadypose.nodes.sinks.recorder import NO_ROOM, RecorderNode
+from steadypose.nodes.sinks.recorder import AHEAD_NS, NO_ROOM, LogTimes, RecorderNode
 from steadypose.nodes.sources.recording import end_of
 
 
@@ -59,6 +59,23 @@ def test_a_disk_that_is_full_before_it_was_noticed(
     assert 0 < node.health.counts[NO_ROOM] <= 30
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.count(POSE_RAW) > 30, "half a second before it at most is lost"
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        ([5, 7, 6, 8], [5, 7, 7, 8]),
+        ([5, 2**61, 7, 8], [5, 5, 7, 8]),
+        ([5, 2**61, 7, 2**61, 9], [5, 5, 7, 7, 9]),
+        ([5, AHEAD_NS + 6, AHEAD_NS + 7, AHEAD_NS + 8], [5, 5, AHEAD_NS + 7, AHEAD_NS + 8]),
+    ],
+    ids=["back", "one wrong", "two wrong", "the clock was set"],
+)
+def test_log_times_follow_the_stamps_but_neither_back_nor_to_a_wrong_one(
+    stamps: list[int], expected: list[int]
+) -> None:
+    log_times = LogTimes()
+    assert [log_times.next(POSE_RAW, stamp) for stamp in stamps] == expected
 
 
 def test_what_a_killed_recorder_had_not_written_was_not_taken(
