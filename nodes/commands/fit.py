@@ -42,7 +42,7 @@ def fit(
     """Fit a motion to a whole recording, offline, by optimisation with a learned motion model (HuMoR).
 
     Starts from the result of `clean`, and optimises poses, bone lengths and floor, so that joints match the
-    observations, the motion is likely, and feet in contact stand still. Takes several seconds per second of recording
+    observations, the motion is likely, and feet in contact stand still. Takes a second or more per second of recording
     and body. If it is stopped, the same command resumes after the last finished window. If a fit fails, the result of
     `clean` is kept and flagged as an anomaly.
 

@@ -295,7 +295,7 @@ def fit(
     weights: str = "default",
     delay: int = 8,
 ) -> Poses:
-    """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes seconds per second of one body's motion.
+    """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes a second or more per second of one body.
 
     Args:
         positions: as in `clean`.
