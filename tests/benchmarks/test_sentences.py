@@ -111,6 +111,11 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
     ),
     (
         "docs/complete.md",
+        r"needs the extra `train` and takes (\S+) s per window\.",
+        [("completion", "completion-search", "legs, complete --optimise", "s a window")],
+    ),
+    (
+        "docs/complete.md",
         r"keeps (\S+) to (\S+) times the true acceleration, instead of (\S+) to (\S+)\.",
         [("interpolation", "interpolation-search", f"{method}, {gap}", "acceleration, of the true")
          for method in ("HM-VAE searched from there", "completer") for gap in (45, 5)],
