@@ -110,7 +110,7 @@ class WebcamSettings:
     def __post_init__(self) -> None:
         check_range("[input.webcam] camera", self.camera, 0, 1000)
         check_range("[input.webcam] bodies", self.bodies, 1, 64)
-        check_range("[input.webcam] field_of_view", self.field_of_view, 0.1, 3.0)
+        check_range("[input.webcam] field_of_view, in radians", self.field_of_view, 0.1, 3.0)
 
 
 class RecordedSource(Protocol):

@@ -77,7 +77,7 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[input.ros2]\ntype = 'Image'", "expected MarkerArray or PoseArray, got 'Image'"),
         ("[input.ros2]\nup = 'x'", "expected z, y or -y"),
         ("[input.webcam]\ncamera = -1", r"\[input\.webcam\] camera: expected"),
-        ("[input.webcam]\nfield_of_view = 60.0", r"\[input\.webcam\] field_of_view: expected"),
+        ("[input.webcam]\nfield_of_view = 60.0", r"\[input\.webcam\] field_of_view, in radians: expected"),
         ("[input.oak]\nconfidence = 50", "confidence: expected 0 to 1, got 50"),
         ("[input.oak]\nfps = -1", "fps: expected 0 "),
         ("[input]\nsource = 'oka'", r"source: expected .*oak.*, got 'oka', did you mean 'oak'"),
