@@ -25,7 +25,7 @@ from steadypose.nodes.commands.inspect import (
     subscribe,
 )
 from steadypose.nodes.commands.output import plural, printable
-from steadypose.nodes.driving import Diagnosis
+from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.sources.npz import is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
@@ -168,6 +168,8 @@ def describe_file(path: Path) -> Iterator[str]:
     for _, message in source:
         if isinstance(message, PoseRaw):
             diagnosis.see(message)
+            if diagnosis.frames % CHECKED == 0:
+                diagnosis.look()
             stamps.append(message.stamp_ns / 1e9)
             skeletons.add(message.skeleton)
             for body in message.bodies:
@@ -181,4 +183,5 @@ def describe_file(path: Path) -> Iterator[str]:
     yield f"body ids {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
     for cause, count in source.refused.items():
         yield f"refused, {cause}: {count}"
-    yield from diagnosis.look()
+    diagnosis.end()
+    yield from diagnosis.texts

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.nodes.conftest import record, walk
+from tests.nodes.conftest import record, walk, walked, write_npz
 
 from steadypose.msgs.types import JointState, PoseRaw
 from steadypose.nodes.cli import main
@@ -124,3 +124,10 @@ def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
     origin, up, left = view(np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
     assert up[1] > origin[1] + 0.9
     assert left[0] > origin[0] + 0.8
+
+
+def test_info_tells_of_problems_anywhere_in_a_file(tmp_path: Path, capsys) -> None:
+    millimetres = np.full((240, 22, 3), np.nan)
+    millimetres[:60] = 1000 * walked(60)
+    assert main(["info", str(write_npz(tmp_path / "in.npz", millimetres))]) == 0
+    assert "millimetres, expected metres; divide by 1000" in capsys.readouterr().out
