@@ -64,7 +64,8 @@ class TrajectoryNode(Node):
         pipeline = self._client_pipelines.pop(source, None) or TrajectoryPipeline(self._settings)
         self._client_pipelines[source] = pipeline
         if len(self._client_pipelines) > clients:  # a client reconnected under another name
-            del self._client_pipelines[next(iter(self._client_pipelines))]
+            forgotten = self._client_pipelines.pop(next(iter(self._client_pipelines)))
+            self._pipeline.counters.update(forgotten.counters)
         return pipeline
 
     def problems(self) -> list[Problem]:

@@ -4,13 +4,15 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import VirtualClock, listeners, running, until, walk
+from tests.helpers.msg_strategies import clean
 
 from steadypose.msgs.security import create_keys
-from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
-from steadypose.msgs.types import PoseRaw, PoseWorld
+from steadypose.msgs.types import Pose, PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
@@ -66,6 +68,15 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
         assert {round(m.stamp_ns / 1e6) for m in answers[name]} <= captured, "stamps are of its own clock"
         assert {body.id for m in answers[name] for body in m.bodies} == set(range(bodies))
         assert all(len(m.bodies) == bodies for m in answers[name])
+
+
+def test_counts_of_a_client_that_came_back_under_another_name_stay(make_launch: Callable[..., Launch]) -> None:
+    node = TrajectoryNode(
+        make_launch(nodes='["trajectory"]', server__clients='["tcp://127.0.0.1:1"]', transport__lossless="false")
+    )
+    for name in ("door", "desk", "hall"):
+        node.handle(POSE_CLEAN, dataclasses.replace(clean(), source=name, sensor_pose=Pose(np.zeros(3), np.zeros(4))))
+    assert node.status()["refused.sensor_pose_invalid"] == "3"
 
 
 @pytest.mark.parametrize(
