@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,14 +85,18 @@ def fit(
     terminal, started = console(), time.perf_counter()
     folder = out.with_name(f".{out.name}.fit")
     folder.mkdir(exist_ok=True)
-    with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
-        if two_d:
-            frames, tracks, lines = _fit_picture(source, out, model, folder, progress)
-        else:
-            frames, tracks, lines = _fit_poses(source, out, model, folder, delay, progress)
-    if shape is not None:
-        lines += _write_smpl(out, shape, tracks)
-    shutil.rmtree(folder)
+    try:
+        with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
+            if two_d:
+                frames, tracks, lines = _fit_picture(source, out, model, folder, progress)
+            else:
+                frames, tracks, lines = _fit_poses(source, out, model, folder, delay, progress)
+        if shape is not None:
+            lines += _write_smpl(out, shape, tracks)
+        shutil.rmtree(folder)
+    finally:
+        with suppress(OSError):  # it holds windows, from which the next call resumes, or is gone
+            folder.rmdir()
     spent = time.perf_counter() - started
     terminal.print(f"{out}: {frames} frames, fitted in {spent:.1f} s")
     for line in lines:

@@ -144,6 +144,7 @@ def test_what_cannot_be_done_is_said(
     write_npz(tmp_path / "empty.npz", np.full((FRAMES, 22, 3), np.nan))
     assert main(["fit", str(tmp_path / source), str(tmp_path / out)]) == 2
     assert says in capsys.readouterr().err
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize(
