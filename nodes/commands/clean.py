@@ -19,6 +19,7 @@ from steadypose.nodes.commands.output import (
     check_output,
     clean_recording,
     console,
+    plural,
     printable,
 )
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
@@ -110,7 +111,7 @@ def clean(
             advanced=lambda: progress.advance(bar),
         )
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
-    terminal.print(f"{out}: {done.frames} frames, {spent}")
+    terminal.print(f"{out}: {plural(done.frames, 'frame', 'frames')}, {spent}")
     for cause, count in done.refused.items():
         terminal.print(f"  not used as given, {cause}: {count}")
     for problem in done.problems:

@@ -10,7 +10,7 @@ import tyro
 
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, unfinished
+from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, plural, unfinished
 from steadypose.nodes.driving import stream
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import STREAMS, LaunchError, located
@@ -80,7 +80,7 @@ def export(
     with unfinished(out) as part:
         part.write_bytes(content)
         part.replace(out)
-    console().print(f"{out}: {len(motion.root)} frames at {motion.fps:g} Hz")
+    console().print(f"{out}: {plural(len(motion.root), 'frame', 'frames')} at {motion.fps:g} Hz")
     return 0
 
 
@@ -143,7 +143,8 @@ def retarget(
     if not poses:
         whom = "nobody" if body is None else f"no body {body}"
         raise LaunchError(
-            f"{source}: {whom} to follow in {frames} frames; `steadypose info {source}` says who is there"
+            f"{source}: {whom} to follow in {plural(frames, 'frame', 'frames')}; `steadypose info {source}` says who "
+            "is there"
         )
     stamp_ns, root, joints, stands = (np.array(column) for column in zip(*poses, strict=True))
     with unfinished(out) as part:
@@ -155,5 +156,5 @@ def retarget(
             table = np.column_stack([(stamp_ns - stamp_ns[0]) / 1e9, root, joints])
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")
         part.replace(out)
-    print(f"{out}: {len(poses)} frames of {len(robot.joints)} joints")
+    print(f"{out}: {plural(len(poses), 'frame', 'frames')} of {len(robot.joints)} joints")
     return 0

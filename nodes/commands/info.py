@@ -92,7 +92,7 @@ class _Contents:
         if isinstance(message, PoseRaw):
             self._note("skeleton", message.skeleton)
         if isinstance(message, PoseClean):
-            self._note("delay", f"{message.delay_frames} frames")
+            self._note("delay", plural(message.delay_frames, "frame", "frames"))
         if isinstance(message, PoseEvents):
             self._bodies.update(event.body for event in message.events)
         else:
@@ -179,9 +179,10 @@ def describe_file(path: Path) -> Iterator[str]:
                     seen.append(there.mean())
     rate = Rate(stamps)
     share = f"{np.mean(seen):.0%} of their joints observed" if seen else "nobody in any frame"
-    yield f"{rate.count} frames{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
+    count = plural(rate.count, "frame", "frames")
+    yield f"{count}{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
     yield f"body ids {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
-    for cause, count in source.refused.items():
-        yield f"refused, {cause}: {count}"
+    for cause, number in source.refused.items():
+        yield f"refused, {cause}: {number}"
     diagnosis.end()
     yield from diagnosis.texts

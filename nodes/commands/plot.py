@@ -11,6 +11,7 @@ from typing import Annotated
 
 import tyro
 
+from steadypose.nodes.commands.output import plural
 from steadypose.nodes.sinks.plot.figure import check_picture, draw, save
 from steadypose.nodes.sinks.plot.history import PlotError, history_of_path
 
@@ -55,7 +56,7 @@ def plot(
             frames = write_overlay(recording, over, video, body)
         else:
             frames = write_video(history_of_path(recording), video, body)
-        print(f"wrote {video}: {frames} frames")
+        print(f"wrote {video}: {plural(frames, 'frame', 'frames')}")
         return
     output = output or Path(f"{recording.resolve().stem}.png")
     check_picture(output)

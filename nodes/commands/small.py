@@ -9,6 +9,7 @@ import tyro
 
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.security import create_keys
+from steadypose.nodes.commands.output import plural
 from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
@@ -58,8 +59,9 @@ def repair(
             writer.write(topic, message, stamp_ns)
             saved += 1
         undecodable = recording.refused.total()
-        print(f"{out}: {saved} messages; lost: {recording.lost_bytes} bytes in {recording.gaps} places", end="")
-        print(f", {undecodable} messages that cannot be decoded" if undecodable else "")
+        lost = f"{recording.lost_bytes} bytes in {plural(recording.gaps, 'place', 'places')}"
+        print(f"{out}: {plural(saved, 'message', 'messages')}; lost: {lost}", end="")
+        print(f", {plural(undecodable, 'message', 'messages')} that cannot be decoded" if undecodable else "")
         return 1 if recording.lost_bytes or undecodable else 0
 
 

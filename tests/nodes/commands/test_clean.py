@@ -13,6 +13,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState, Pose, PoseClean, PoseWorld
 from steadypose.nodes.commands.clean import clean
+from steadypose.nodes.commands.info import info
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
@@ -48,6 +49,14 @@ def test_npz_to_npz(tmp_path: Path) -> None:
     assert (out["state"] != JointState.UNKNOWN).all()
     np.testing.assert_array_equal(out["stamp_ns"], np.round(np.arange(FRAMES) * 1e9 / 30))
     np.testing.assert_allclose(np.linalg.norm(out["rotations"], axis=-1), 1.0, atol=1e-5)
+
+
+def test_a_single_frame_is_counted_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = write_npz(tmp_path / "in.npz", walked(1))
+    clean(source, tmp_path / "out.npz")
+    assert "out.npz: 1 frame, " in capsys.readouterr().err
+    info(str(source))
+    assert "1 frame," in capsys.readouterr().out
 
 
 def test_jittered_stamps_come_back_as_they_were(tmp_path: Path) -> None:

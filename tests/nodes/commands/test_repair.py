@@ -22,7 +22,7 @@ def damaged(tmp_path: Path) -> Path:
 
 def test_what_is_left_is_saved_and_what_is_lost_is_said(damaged: Path, tmp_path: Path, capsys) -> None:
     assert repair(damaged, tmp_path / "out") == 1
-    assert "bytes in 1 places" in capsys.readouterr().out
+    assert "bytes in 1 place\n" in capsys.readouterr().out
     with RecordingReader(tmp_path / "out") as recording:
         assert recording.complete
         assert 60 - 16 <= recording.count(POSE_RAW) < 60
