@@ -32,7 +32,8 @@ def export(
     """Write cleaned motion as a file for other programs. The ending of OUT chooses the format.
 
     The file holds one person, in the world frame (floor at 0 if the sensor's pose is calibrated), at the input's frame
-    rate. Bone lengths are constant, the rotations are those of 'clean', and the rest pose is a T-pose.
+    rate. Bone lengths are constant, the rotations are those of 'clean', the body is placed by all its joints, and the
+    rest pose is a T-pose.
       .bvh   animation programs: centimetres, y up, facing +z
       .glb   Blender, Unity, Unreal, browsers: a body with bones; metres, y up
       .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop

@@ -79,14 +79,17 @@ def read_motion(path: Path, body: int | None = None) -> BodyMotion:
 
 def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion:
     """Resample a motion to a constant rate, with constant bone lengths, from stamps (T,) seconds, increasing, positions
-    (T, 22, 3) metres, world, and local rotations (T, 22, 4) xyzw.
+    (T, 22, 3) metres, world, and local rotations (T, 22, 4) xyzw. The body is placed by the mean of all its joints: its
+    bones do not fit the positions, and placed by the pelvis, it would be off by the pelvis' error as a whole.
     """
     fps = _rate(stamps_s)
+    body = BodyMotion(fps, positions[:, 0], rotations, _bones(positions, rotations))
+    placed = body.root + (positions - body.positions).mean(axis=1)
     at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * fps + 0.01) + 1) / fps
     at = at.clip(max=stamps_s[-1])
     turned = np.stack([Slerp(stamps_s, Rotation.from_quat(rotations[:, j]))(at).as_quat() for j in range(22)], axis=1)
-    root = np.stack([np.interp(at, stamps_s, positions[:, 0, axis]) for axis in range(3)], axis=1)
-    return BodyMotion(fps, root, turned, _bones(positions, rotations), float(stamps_s[0]))
+    root = np.stack([np.interp(at, stamps_s, placed[:, axis]) for axis in range(3)], axis=1)
+    return BodyMotion(fps, root, turned, body.offsets, float(stamps_s[0]))
 
 
 COMMON_HZ = (10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 144.0, 150.0,

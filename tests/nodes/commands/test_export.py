@@ -202,6 +202,13 @@ def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: F
     assert len(found.root) == pytest.approx((stamps[-1] - stamps[0]) * found.fps + 1, abs=1)
 
 
+def test_a_body_is_placed_by_all_its_joints(motion: BodyMotion) -> None:
+    seen = motion.positions
+    seen[::3, 0] += [0.0, 0.0, 0.05]
+    found = steady(np.arange(FRAMES) / 30, seen, motion.rotations)
+    np.testing.assert_allclose(found.positions, motion.positions, atol=0.05 / 22 + 1e-6)
+
+
 def test_stamps_that_decrease_are_refused_with_what_to_do(tmp_path: Path, motion: BodyMotion, capsys) -> None:
     path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
     with np.load(path) as file:
