@@ -5,6 +5,7 @@ One recording is cleaned here, for `clean` and for each process of a folder's.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import time
@@ -95,7 +96,11 @@ def check_replaceable(out: Path, *, replace: bool, is_file: bool) -> None:
 
 @contextmanager
 def unfinished(out: Path) -> Iterator[Path]:
-    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name."""
+    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name.
+
+    Raises:
+        LaunchError: the folder cannot be written to, or the disk is full.
+    """
     folder = out.with_name(f".{out.name}.part")
     mark = folder / ".steadypose"
     if mark.exists():
@@ -109,6 +114,10 @@ def unfinished(out: Path) -> Iterator[Path]:
     try:
         mark.touch()
         yield folder / out.name
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise LaunchError(f"{out}: {os.strerror(error.errno)}; make room, or write it elsewhere") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

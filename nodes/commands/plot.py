@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from steadypose.nodes.commands.output import plural
+from steadypose.nodes.commands.output import plural, unfinished
 from steadypose.nodes.sinks.plot.figure import check_picture, draw, save
 from steadypose.nodes.sinks.plot.history import PlotError, history_of_path
 
@@ -52,15 +52,19 @@ def plot(
         from steadypose.nodes.sinks.plot.video import VIDEOS, write_overlay, write_video
 
         check_picture(video, VIDEOS)
-        if over is not None:
-            frames = write_overlay(recording, over, video, body)
-        else:
-            frames = write_video(history_of_path(recording), video, body)
+        with unfinished(video) as part:
+            if over is not None:
+                frames = write_overlay(recording, over, part, body)
+            else:
+                frames = write_video(history_of_path(recording), part, body)
+            part.replace(video)
         print(f"wrote {video}: {plural(frames, 'frame', 'frames')}")
         return
     output = output or Path(f"{recording.resolve().stem}.png")
     check_picture(output)
-    save(draw(history_of_path(recording), body), output)
+    with unfinished(output) as part:
+        save(draw(history_of_path(recording), body), part)
+        part.replace(output)
     print(f"wrote {output}")
 
 

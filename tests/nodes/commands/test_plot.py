@@ -1,3 +1,4 @@
+import errno
 from collections.abc import Callable, Collection
 from pathlib import Path
 
@@ -160,6 +161,20 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str,
     recording = record(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
     with pytest.raises(PlotError, match=expected):
         plot(recording, tmp_path / output, **options)
+
+
+def test_a_full_disk_is_said_and_the_picture_that_was_there_stays(tmp_path: Path, monkeypatch) -> None:
+    def save_half(figure: Figure, path: Path, **options: object) -> None:
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    recording, picture = record(tmp_path / "bag", 0.2, {POSE_RAW}), tmp_path / "picture.png"
+    picture.write_bytes(b"whole")
+    monkeypatch.setattr(Figure, "savefig", save_half)
+    with pytest.raises(LaunchError, match=r"picture.png: No space left on device; make room"):
+        plot(recording, picture)
+    assert picture.read_bytes() == b"whole"
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "picture.png"}
 
 
 def test_the_title_tells_an_id_from_a_count(tmp_path: Path) -> None:
