@@ -7,11 +7,22 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
+from rich.progress import Progress
 
 from steadypose.msgs.topics import POSE_WORLD
-from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.nodes.commands.output import ARRAY_FILES, File, In, Out, check_file, console, plural, unfinished
-from steadypose.nodes.driving import stream
+from steadypose.msgs.types import PoseWorld
+from steadypose.nodes.commands.output import (
+    ARRAY_FILES,
+    UNTRUSTED,
+    File,
+    In,
+    Out,
+    check_file,
+    console,
+    plural,
+    unfinished,
+)
+from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import STREAMS, LaunchError, located
 from steadypose.nodes.sources.recording import open_recording
@@ -100,7 +111,7 @@ def retarget(
     """Clean a recording, and convert the person's motion to that of a robot.
 
     Joints respect the position and velocity limits of the URDF, and standing feet do not slide. If there are several
-    people, the robot follows one at a time.
+    people, the robot follows one at a time. The exit status is 1 if OUT cannot be trusted, as for `clean`.
 
     Try:
       steadypose retarget walk_turn walk.csv --urdf launch/robots/humanoid29.urdf
@@ -119,9 +130,6 @@ def retarget(
     if urdf is None:
         raise LaunchError("expected --urdf FILE, the robot's; launch/robots/humanoid29.urdf is one to try with")
     require_extra("retarget")
-    from steadypose.nodes.graph.prior_node import make_prior
-    from steadypose.nodes.graph.threads import one_thread
-    from steadypose.nodes.graph.trajectory_node import make_trajectory
     from steadypose.nodes.sinks.retarget import Follower, Retargeter
     from steadypose.nodes.sinks.robot import load_robot
 
@@ -131,21 +139,27 @@ def retarget(
         if not separator:
             raise LaunchError(f"--link: expected PART=LINK, such as left_foot=l_sole, got {link!r}")
         given[part] = name
-    one_thread()
+    frames = open_recording(source)
+    run = OfflineRun(frames, {"prior": {}, "trajectory": {}})
     robot = load_robot(urdf, given)
     follower = Follower(Retargeter(robot, sole), body)
-    frames = 0
     poses = []
-    for topic, message in stream(open_recording(source), make_prior({}), make_trajectory({})):
-        frames += isinstance(message, PoseRaw) and not message.end_of_stream
-        # a simulated recording also has its truth, as PoseWorld
-        if topic == POSE_WORLD and isinstance(message, PoseWorld) and (pose := follower.process(message)) is not None:
-            poses.append(pose)
+    terminal = console()
+    with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
+        bar = progress.add_task(source.name, total=len(frames))
+        for topic, message in run:
+            progress.update(bar, completed=run.diagnosis.frames)
+            # a simulated recording also has its truth, as PoseWorld
+            world = message if topic == POSE_WORLD and isinstance(message, PoseWorld) else None
+            if world and (pose := follower.process(world)) is not None:
+                poses.append(pose)
+    for problem in run.diagnosis.texts:
+        terminal.print(f"  {problem}", style="yellow")
     if not poses:
         whom = "nobody" if body is None else f"no body {body}"
         raise LaunchError(
-            f"{source}: {whom} to follow in {plural(frames, 'frame', 'frames')}; `steadypose info {source}` says who "
-            "is there"
+            f"{source}: {whom} to follow in {plural(run.diagnosis.frames, 'frame', 'frames')}; `steadypose info "
+            f"{source}` says who is there"
         )
     stamp_ns, root, joints, stands = (np.array(column) for column in zip(*poses, strict=True))
     with unfinished(out) as part:
@@ -158,4 +172,6 @@ def retarget(
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")
         part.replace(out)
     print(f"{out}: {plural(len(poses), 'frame', 'frames')} of {len(robot.joints)} joints")
-    return 0
+    if not run.diagnosis.trusted:
+        terminal.print(f"  {UNTRUSTED}", style="red")
+    return 0 if run.diagnosis.trusted else 1

@@ -284,6 +284,13 @@ def test_the_command_follows_the_cleaned_poses_and_not_the_truth_beside_them(tmp
         assert found["root"][:, 0].max() < 20.0
 
 
+def test_the_command_tells_what_is_wrong_with_its_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    upright = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]])
+    np.savez(tmp_path / "in.npz", positions=upright[..., [1, 2, 0]], skeleton="smpl22", fps=30.0)  # y is up
+    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), "--urdf", str(URDF)]) == 1
+    assert "up_axis" in capsys.readouterr().err
+
+
 def test_the_study_finds_a_breach_a_joint_too_fast_and_feet_that_slide_or_sink(robot: Robot) -> None:
     still = np.clip(np.zeros(29), robot.lower, robot.upper)
     knee = robot.joints.index("left_knee_joint")
