@@ -35,7 +35,7 @@ COMMANDS = {
     "hz": ("inspect", "measure the rate of a topic or recording"),
     "info": ("info", "describe a recording, a file of poses or a topic"),
     "repair": ("small", "write the readable part of a damaged recording to a new one"),
-    "plot": ("plot", "plot a recording as an image or a video"),
+    "plot": ("small", "plot a recording as an image or a video"),
     "prepare": ("prepare", "convert motion capture to training data"),
     "train": ("train", "train a model of the prior"),
     "evaluate": (EVALUATE, "measure accuracy and speed beside tuned baselines"),

@@ -30,8 +30,7 @@ from steadypose.prior.events.detector import EventDetector
 from steadypose.prior.events.features import features
 from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.streams import START_NS
-from steadypose.prior.world.legs import LEG_CONTACTS
-from steadypose.prior.world.observe import FEET
+from steadypose.prior.world.observe import FEET, LEG_CONTACTS
 
 DEPENDS_ON = (*WORLD, "prior.events")
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.msgs.subscriber import SECOND
 from steadypose.msgs.types import Level, PoseRaw, RawBody
 
 PREFIX = "problem."
@@ -111,3 +112,20 @@ def observed(body: RawBody) -> NDArray[np.float64]:
     if len(body.confidence) == len(positions):
         missing |= body.confidence <= 0.0
     return np.where(missing[:, None], np.nan, positions)
+
+
+def check_wire(refused: Counter[str]) -> Iterator[Problem]:
+    """Problems with the frames that a subscriber has just refused: their numbers by cause."""
+    if second := refused[SECOND]:
+        yield error(
+            "second_publisher",
+            f"{second} messages came from a second publisher with the same source name, and were refused: "
+            "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
+            "one of the two",
+        )
+    if invalid := {cause: count for cause, count in refused.items() if cause != SECOND}:
+        yield error(
+            "not_a_message",
+            f"{sum(invalid.values())} frames were not valid messages ({', '.join(sorted(invalid))}): expected the "
+            "topic, a zero byte, a header of 17 bytes, and CDR (docs/other_languages.md)",
+        )

@@ -1,4 +1,4 @@
-"""Commands of one call each: ``keys``, ``repair`` and ``simulate``."""
+"""Commands of one call each: ``keys``, ``repair``, ``simulate`` and ``plot``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import tyro
 
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.security import create_keys
-from steadypose.nodes.commands.output import plural
+from steadypose.nodes.commands.output import plural, unfinished
 from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
@@ -92,3 +92,61 @@ def simulate(
     for name in stream or known:
         record(known[name], out / name)
         print(f"{out / name}: {known[name].what}")
+
+
+def plot(
+    recording: Annotated[Path, tyro.conf.Positional],
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
+    body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    over: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO")] = None,
+) -> None:
+    """Plot a recording as an image or a video.
+
+    Try:
+      steadypose plot walk_turn
+      steadypose plot cleaned --video walk.gif
+
+    Args:
+        recording: rosbag2 directory or .mcap with any of pose/raw, pose/clean, pose/world, pose/truth; or a file of
+            poses in a format of 'clean'.
+        output: image to write: .png, .svg or .pdf. Default: named after the recording, in the current folder.
+        body: id of the body to draw. Default: the one that is visible longest.
+        video: video to write instead: .gif, or .mp4 (needs the extra 'oak'). It shows raw, clean and world side by
+            side.
+        over: the video that was cleaned, as in 'steadypose clean walk.mp4 walk'. With --video, raw (not in an .npz)
+            and clean are drawn over its images, with the field of view that 'clean' assumes.
+
+    Raises:
+        RecordingError: the recording cannot be read.
+        PlotError: there is nothing to draw, no such body, or nowhere to write to.
+    """
+    import matplotlib  # noqa: F401  (first of all: what is not installed is said before anything else)
+
+    from steadypose.nodes.sinks.plot.figure import check_picture, draw, save
+    from steadypose.nodes.sinks.plot.history import PlotError, history_of_path
+
+    if recording.is_dir() and not any(recording.glob("*.mcap")) and (inside := {*recording.glob("*/*.mcap")}):
+        folders = sorted({str(file.parent) for file in inside})
+        few = ", ".join(folders[:4])
+        raise PlotError(f"{recording}: expected one recording, got a folder of {len(folders)}; name one, such as {few}")
+    if over is not None and video is None:
+        raise PlotError("over: expected --video FILE.mp4 too, the video to write")
+    if video is not None:
+        from steadypose.nodes.sinks.plot.video import VIDEOS, write_overlay, write_video
+
+        check_picture(video, VIDEOS)
+        with unfinished(video) as part:
+            if over is not None:
+                frames = write_overlay(recording, over, part, body)
+            else:
+                frames = write_video(history_of_path(recording), part, body)
+            part.replace(video)
+        print(f"wrote {video}: {plural(frames, 'frame', 'frames')}")
+        return
+    output = output or Path(f"{recording.resolve().stem}.png")
+    check_picture(output)
+    with unfinished(output) as part:
+        save(draw(history_of_path(recording), body), part)
+        part.replace(output)
+    print(f"wrote {output}")

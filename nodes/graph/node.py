@@ -31,8 +31,7 @@ from steadypose.msgs.delivery import DEAF_S, Principals
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.checks.problem import Problem, error
-from steadypose.nodes.checks.wire import check_wire
+from steadypose.nodes.checks.problem import Problem, check_wire, error
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
 from steadypose.nodes.graph.health import STALL_NS, Health

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.wire import check_wire
+from steadypose.nodes.checks.problem import Problem, check_wire, error, warning
 from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.settings import LaunchError, check_addresses
 from steadypose.nodes.sources.source import MODEL, LiveSource, OakSettings, SourceContext, WebcamSettings

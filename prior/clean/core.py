@@ -16,9 +16,8 @@ from steadypose.prior.clean.fuse import Fuse
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import impute
-from steadypose.prior.clean.mixtures import mix
 from steadypose.prior.clean.occluded import Track
-from steadypose.prior.clean.posture import Posture
+from steadypose.prior.clean.posture import Posture, mix
 from steadypose.prior.clean.reconstruct import Denoise, Reconstruct
 from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer

@@ -1,4 +1,4 @@
-"""The posture stage: joints inform each other.
+"""The posture stage: joints inform each other; and joints of the trunk that the sensor lacks (`mix`).
 
 A filter over time cannot remove an error that lasts. Such an error contradicts the rest of the body, though: it bends a
 spine sideways, or sets a knee where no knee is under that hip. The posterior mean of a Gaussian of postures
@@ -18,6 +18,7 @@ import numpy as np
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Floats
+from steadypose.prior.body import mixtures
 from steadypose.prior.clean.frame import Estimate
 from steadypose.prior.clean.settings import PostureSettings
 from steadypose.prior.models.posture import LivePosture
@@ -66,3 +67,19 @@ class Posture:
         surer = (1.0 - sure) * share * np.minimum(expected.sigma - sigma[slots], 0.0)
         sigma[slots] += np.where(observed, surer, 0.0)  # errors of a hidden joint are less like the Gaussian's
         return replace(estimate, positions=positions, sigma=sigma)
+
+
+def mix(estimate: Estimate, unseen_s: Floats) -> Estimate:
+    """Return a frame's estimate with means in place of joints of the trunk that were never observed, by the seconds
+    (S, 22) since each was (inf if never); rotations stay. A mean tells nothing about the joints that it is made of, so
+    the stages before do not count it.
+    """
+    lacking = np.isinf(unseen_s) & np.isfinite(estimate.positions[:, :1, 0])
+    if not (mixed := mixtures.mixed(lacking)).any():
+        return estimate
+    of_parts = np.einsum("jk,sk->sj", np.square(mixtures.SHARES), np.square(estimate.sigma))
+    return replace(
+        estimate,
+        positions=mixtures.mix(estimate.positions, lacking),
+        sigma=np.where(mixed, np.sqrt(np.square(mixtures.SIGMA) + of_parts), estimate.sigma),
+    )

@@ -4,8 +4,8 @@ While the root is observed, joints keep their positions from `pose/clean`. The e
 still, and the leg joints that bones connect to them. While the root is unobserved, the whole body moves with its root.
 A body with both feet at rest is published as standing, with the root velocity of a swaying body.
 
-Legs that are only guesses (`legs`) have no contacts. Their feet may still be placed as if they stood, because a guess
-on the floor is better than one above it, but that makes them no more certain.
+Legs that are only guesses (`LegMemory`) have no contacts. Their feet may still be placed as if they stood, because a
+guess on the floor is better than one above it, but that makes them no more certain.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.world.core import BodyEstimate
-from steadypose.prior.world.legs import FEET_OF_LEGS, LEG_CONTACTS
-from steadypose.prior.world.observe import FEET
+from steadypose.prior.world.observe import FEET, FEET_OF_LEGS, LEG_CONTACTS
 
 LENGTH_SIGMA = 0.025
 """Standard deviation of a leg bone's length, whether measured by a biased sensor or of a generic adult, metres."""

@@ -13,7 +13,6 @@ from steadypose.prior.world.feet import Feet, FeetState
 from steadypose.prior.world.filter import RootFilter, RootState
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
-from steadypose.prior.world.legs import FEET_OF_LEGS, LegMemory
 from steadypose.prior.world.networks import (
     ContactMemory,
     ContactNetwork,
@@ -23,7 +22,7 @@ from steadypose.prior.world.networks import (
     VelocityNetwork,
     stance,
 )
-from steadypose.prior.world.observe import BodyObservation
+from steadypose.prior.world.observe import FEET_OF_LEGS, BodyObservation, LegMemory
 from steadypose.prior.world.settings import TrajectorySettings
 
 _NO_STANCE = Stance(np.zeros(4), np.zeros(4))

@@ -11,7 +11,7 @@ from tests.helpers.synthetic_poses import messages
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
-from steadypose.nodes.commands.plot import plot
+from steadypose.nodes.commands.small import plot
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path

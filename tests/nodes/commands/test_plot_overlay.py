@@ -11,7 +11,7 @@ from tests.helpers.synthetic_poses import START_NS, messages
 
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import JointState, PoseClean
-from steadypose.nodes.commands.plot import plot
+from steadypose.nodes.commands.small import plot
 from steadypose.nodes.sinks.plot.history import PlotError
 from steadypose.nodes.sources.source import WebcamSettings
 from steadypose.prior.body.skeleton import J

@@ -4,7 +4,7 @@ import pytest
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.frame import Estimate
-from steadypose.prior.clean.mixtures import mix
+from steadypose.prior.clean.posture import mix
 
 RNG = np.random.default_rng(4)
 SPINES, COLLARS = [J["spine1"], J["spine2"]], [J["left_collar"], J["right_collar"]]

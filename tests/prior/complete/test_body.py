@@ -6,7 +6,7 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.complete import parts, splines
+from steadypose.prior.complete import body, parts
 from steadypose.prior.complete.body import Uncertainty, complete
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
@@ -79,7 +79,7 @@ def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of
 )
 def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
     for share in ("WHOLE", "PART", "LOWER_ARM"):  # splines do not know it
-        monkeypatch.setattr(splines, share, (0.0, 1.0))
+        monkeypatch.setattr(body, share, (0.0, 1.0))
     positions = waving(300)
     seen = positions.copy()
     seen[hidden] = np.nan
@@ -267,7 +267,7 @@ def test_short_gaps_are_nearer_to_each_joints_spline_than_long_ones() -> None:
 def test_a_lower_arm_follows_its_spline_less_where_its_shoulder_is_known() -> None:
     known = np.ones((60, 22), dtype=bool)
     known[20:30, [J["left_wrist"], J["right_shoulder"], J["right_wrist"], J["left_foot"]]] = False
-    share, _ = splines.splines(waving(60), known)
+    share, _ = body.splines(waving(60), known)
     parts = "left_wrist", "right_shoulder", "right_wrist", "left_foot"
     np.testing.assert_allclose(share[25, [J[part] for part in parts]], (0.4, 0.6, 0.6, 0.6))
     assert not share[25, known[25]].any()

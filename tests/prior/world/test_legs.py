@@ -6,8 +6,7 @@ import pytest
 
 from steadypose.msgs.types import CONTACTS
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.world.legs import FEET_OF_LEGS, GUESSED_S, LEG_CONTACTS, LegMemory
-from steadypose.prior.world.observe import FEET
+from steadypose.prior.world.observe import FEET, FEET_OF_LEGS, GUESSED_S, LEG_CONTACTS, LegMemory
 
 DT = 1 / 30
 
