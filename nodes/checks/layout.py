@@ -17,7 +17,14 @@ from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.settings import nearest
 
 UNIT_TOLERANCE = 0.01
-_LAYOUT_OF = {"mediapipe": "blazepose33", "azure": "azure_kinect32", "k4a": "azure_kinect32", "body38": "zed38"}
+_LAYOUT_OF = {
+    **dict.fromkeys(("mediapipe", "mediapipe33"), "blazepose33"),
+    **dict.fromkeys(("human3.6m", "human36m"), "h36m17"),
+    **dict.fromkeys(("azure", "k4a"), "azure_kinect32"),
+    "body25": "openpose25",
+    "body38": "zed38",
+}
+"""Names by which others know a layout, in small letters and without separators."""
 ENOUGH = 5
 """Smallest number of messages to judge by."""
 
@@ -225,10 +232,12 @@ def axes_hint(shape: Sequence[int], skeleton: str) -> str:
 
 def stamps_hint(stamps: NDArray[Any], frames: int) -> str:
     """A hint for stamps that are not integer nanoseconds, one per frame."""
-    if stamps.ndim != 1 or stamps.dtype.kind not in "fiu":
+    if stamps.ndim != 1 or stamps.dtype.kind not in "fiuM":
         return ""
     if len(stamps) != frames:
         return f"; one stamp a frame: {frames} frames, {len(stamps)} stamps"
+    if stamps.dtype.kind == "M":
+        return "; of dates: np.asarray(stamps, 'datetime64[ns]').astype(np.int64)"
     if stamps.dtype.kind == "f":
         step = float(np.median(np.diff(stamps))) if frames > 1 else 0.0
         for unit, factor in (("seconds", 10**9), ("milliseconds", 10**6), ("microseconds", 10**3)):

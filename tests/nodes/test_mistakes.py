@@ -74,6 +74,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "a skeleton by another name": (lambda j: clean(j[:, :17], fps=30, skeleton="COCO_17"), "did you mean 'coco17'"),
     "a skeleton by its tracker's name": (lambda j: Filter("MediaPipe"), "did you mean 'blazepose33'"),
+    "Human3.6M by its own name": (lambda j: Filter("Human3.6M"), "did you mean 'h36m17'"),
+    "OpenPose by its model's name": (lambda j: Filter("BODY_25"), "did you mean 'openpose25'"),
     "no skeleton": (lambda j: Filter(None), "name of a layout, or its joints, got None"),
     "a skeleton that nobody knows": (lambda j: Filter(skeleton="thing"), "expected one of smpl22, coco17"),
     "no rate": (lambda j: clean(j), "of a regular stream give fps, 30 for instance"),
@@ -84,6 +86,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "stamps in milliseconds, as floats": (
         lambda j: clean(j, stamp_ns=seconds() * 1e3),
         r"these seem to be milliseconds: np\.round\(stamps \* 1e\+06\)",
+    ),
+    "stamps that are dates": (
+        lambda j: clean(j, stamp_ns=TICKS.astype("datetime64[ns]")),
+        r"of dates: np\.asarray\(stamps, 'datetime64\[ns\]'\)\.astype\(np\.int64\)",
     ),
     "a stamp too many": (
         lambda j: clean(j, stamp_ns=np.arange(FRAMES + 1) * 33_333_333),
