@@ -168,13 +168,13 @@ def source_of(
 
 
 def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
-    """Convert a value to an array.
+    """Convert a value to an array; what is masked is NaN.
 
     Raises:
         NpzError: the value is not an array: lists of different lengths, or of something other than numbers.
     """
     try:
-        array = np.asarray(value)
+        array = np.asarray(value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else value)
     except (ValueError, TypeError, RuntimeError) as error:
         raise NpzError(
             f"{name}: expected numbers of one shape, got {type(value).__name__} ({error}); frames without a "

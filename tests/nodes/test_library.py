@@ -9,7 +9,10 @@ import pytest
 from tests.nodes.conftest import walked, write_npz
 
 import steadypose
+from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.cli import main
+from steadypose.nodes.library.arrays import source_of
+from steadypose.prior.body.skeleton import J
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)
@@ -97,6 +100,14 @@ def test_a_mask_of_what_was_seen_is_a_confidence() -> None:
     live = [cleaner(frame, t / 30, confidence=mask) for t, (frame, mask) in enumerate(zip(joints, seen, strict=True))]
     assert live[-1] is not None
     assert live[-1].state[15] == steadypose.JointState.IMPUTED
+
+
+def test_what_is_masked_is_missing() -> None:
+    joints = walked(3)
+    masked = np.ma.masked_array(joints, np.zeros(joints.shape, bool))
+    masked[1, J["left_wrist"]] = np.ma.masked
+    raws = [message for _, message in source_of(masked, fps=30) if isinstance(message, PoseRaw)]
+    assert np.unique(np.argwhere(np.isnan(raws[1].bodies[0].positions))[:, 0]).tolist() == [J["left_wrist"]]
 
 
 def test_frames_of_confidence_zero_are_not_missed() -> None:
