@@ -30,13 +30,17 @@ class TransportError(ValueError):
     """An address that cannot or must not be used. The text says what to do."""
 
 
+MAX_PORT = 65535
+"""ZeroMQ takes a larger one modulo 65536."""
+
+
 def parse(endpoint: str) -> tuple[str, str]:
     """The transport, and the path or host, of an address. Raises TransportError if the address is malformed."""
     transport, _, address = endpoint.partition("://")
     host, _, port = address.rpartition(":")
     if transport == "ipc" and address:
         return transport, address
-    if transport == "tcp" and host and (port.isdecimal() or port == "*"):
+    if transport == "tcp" and host and (port == "*" or (port.isdecimal() and int(port) <= MAX_PORT)):
         return transport, host.strip("[]")
     raise TransportError(f"address: expected ipc://PATH or tcp://HOST:PORT, got {endpoint!r}")
 

@@ -264,7 +264,8 @@ def test_a_file_at_an_address_is_not_deleted_nor_one_in_the_place_of_its_folder(
 
 
 @pytest.mark.parametrize(
-    "bad", ["", "7101", "tcp://", "tcp://127.0.0.1", "tcp://:1", "tcp://a:b", "udp://a:1", "ipc://"]
+    "bad",
+    ["", "7101", "tcp://", "tcp://127.0.0.1", "tcp://:1", "tcp://a:b", "tcp://127.0.0.1:65536", "udp://a:1", "ipc://"],
 )
 def test_a_malformed_address_is_refused(bad: str):
     expected = r"expected ipc://PATH or tcp://HOST:PORT, got "
