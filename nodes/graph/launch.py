@@ -9,6 +9,7 @@ name ends in ``delay``.
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
@@ -69,6 +70,9 @@ class Launch(_EveryLaunch):
                 raise LaunchError(
                     f"nodes names {node!r}, which is not a node{nearest(node, NODES)}; there are {', '.join(NODES)}"
                 )
+        for node, count in Counter(self.nodes).items():
+            if count > 1:
+                raise LaunchError(f"nodes names {node!r} {count} times: expected each node once")
         if self.server.clients and "pose_input" in self.nodes:
             raise LaunchError("[server] clients have their own pose_input: expected nodes without it, such as prior")
         if self.server.clients and self.transport.lossless:

@@ -222,6 +222,7 @@ class TransportSettings:
     poses"""
 
     def __post_init__(self) -> None:
+        taken: dict[str, str] = {}
         for node, address in self.endpoints.items():
             if not isinstance(address, str):
                 raise LaunchError(f"[transport.endpoints] {node}: expected an address, got {address!r}")
@@ -229,6 +230,10 @@ class TransportSettings:
                 raise LaunchError(
                     f"[transport.endpoints] names {node!r}, which is not a node{nearest(node, NODES)}; "
                     f"nodes are {', '.join(NODES)}"
+                )
+            if (other := taken.setdefault(address, node)) != node and not address.endswith(":*"):
+                raise LaunchError(
+                    f"[transport.endpoints] {node}: expected an address of its own, got {address}, as for {other}"
                 )
         if not self.lifespan_s > 0:
             raise LaunchError(f"[transport] lifespan_s: expected more than 0, got {self.lifespan_s}")
