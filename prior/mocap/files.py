@@ -183,6 +183,11 @@ def _trc(content: bytes, description: Description) -> _Read:
     names = [name.strip() for name in rows[3].split("\t")[2::3]]
     names = names[: max(k + 1 for k, name in enumerate(names) if name)]
     cells = [row.split("\t") for row in rows[5:] if row.strip()]
+    stated = header.get("NumFrames", "").strip()
+    if stated.isdigit() and len(cells) < int(stated):
+        raise MotionError(
+            f"expected {stated} frames, as its header says, got {len(cells)}; the file is cut short: export it again"
+        )
     width = 2 + 3 * len(names)
     values = np.array([[float(c) if c.strip() else np.nan for c in (row + [""] * width)[:width]] for row in cells])
     points = values[:, 2:].reshape(len(values), len(names), 3)

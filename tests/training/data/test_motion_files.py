@@ -81,6 +81,11 @@ def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
     assert np.isnan(body[:, J["spine1"]]).all()
 
 
+def test_a_trc_that_is_cut_short_is_refused() -> None:
+    with pytest.raises(MotionError, match="expected 4 frames, as its header says, got 3; the file is cut short"):
+        read_motion("take.trc", trc(points()).rpartition(b"\n")[0])
+
+
 def test_a_c3d_is_of_joints_or_of_markers_on_the_skin(tmp_path: Path) -> None:
     fps, body = read_motion("take.C3D", c3d(tmp_path / "x.c3d", [f"Anna:{n}" for n in HALPE], points() * 1000))
     assert fps == 100
