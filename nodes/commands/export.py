@@ -91,7 +91,6 @@ def export(
         content = {".csv": to_csv, ".trc": to_trc}[out.suffix](motion)
     with unfinished(out) as part:
         part.write_bytes(content)
-        part.replace(out)
     console().print(f"{out}: {plural(len(motion.root), 'frame', 'frames')} at {motion.fps:g} Hz")
     return 0
 
@@ -170,7 +169,6 @@ def retarget(
         else:
             table = np.column_stack([(stamp_ns - stamp_ns[0]) / 1e9, root, joints])
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")
-        part.replace(out)
     print(f"{out}: {plural(len(poses), 'frame', 'frames')} of {len(robot.joints)} joints")
     if not run.diagnosis.trusted:
         terminal.print(f"  {UNTRUSTED}", style="red")

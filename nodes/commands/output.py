@@ -96,7 +96,8 @@ def check_replaceable(out: Path, *, replace: bool, is_file: bool) -> None:
 
 @contextmanager
 def unfinished(out: Path) -> Iterator[Path]:
-    """Where to write what becomes ``out``: beside it, under the same name, because a recording's file has its name.
+    """Where to write what becomes ``out`` after the block: beside it, under the same name, because a recording's file
+    has its name.
 
     Raises:
         LaunchError: the folder cannot be written to, or the disk is full.
@@ -114,6 +115,7 @@ def unfinished(out: Path) -> Iterator[Path]:
     try:
         mark.touch()
         yield folder / out.name
+        (folder / out.name).replace(out)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -141,7 +143,6 @@ def write_output(
                     writer.write(topic, message, log_times.next(topic, message.stamp_ns))
             if out.exists():
                 shutil.rmtree(out)
-        part.replace(out)
 
 
 def console() -> Console:
@@ -227,7 +228,6 @@ def clean_recording(
     if events and timeline:
         with unfinished(events) as part:
             write_events(part, timeline.events())
-            part.replace(events)
     return Cleaned(
         frames=len(run.stamps_ns),
         duration_s=float(min(np.ptp(run.stamps_ns), np.diff(run.stamps_ns).clip(0).sum())) / 1e9,

@@ -141,12 +141,10 @@ def plot(
                 frames = write_overlay(recording, over, part, body)
             else:
                 frames = write_video(history_of_path(recording), part, body)
-            part.replace(video)
         print(f"wrote {video}: {plural(frames, 'frame', 'frames')}")
         return
     output = output or Path(f"{recording.resolve().stem}.png")
     check_picture(output)
     with unfinished(output) as part:
         save(draw(history_of_path(recording), body), part)
-        part.replace(output)
     print(f"wrote {output}")
