@@ -1,4 +1,4 @@
-"""Occluded joints: each is estimated as a weighted mean of four candidates (`prior.models.occlusion.candidates`).
+"""Occluded joints: each is estimated as a weighted mean of four candidates (`prior.models.occlusion`).
 
 One candidate bridges a gap that ends within the delay, from the joint's own observations on both sides. A bank of
 constant-velocity Kalman filters estimates it. Each filter has the position at the time in question as a further state
@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import HIPS, J, limbs
 from steadypose.prior.compiled import median, njit
-from steadypose.prior.models.occlusion.candidates import FEATURES, average, describe, forget, new_past, observe, stand
-from steadypose.prior.models.occlusion.inference import LiveOcclusion, Occluded, Weighed
+from steadypose.prior.models.occlusion import (
+    FEATURES,
+    LiveOcclusion,
+    Occluded,
+    Weighed,
+    average,
+    describe,
+    forget,
+    new_past,
+    observe,
+    stand,
+)
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.timing.rate import FPS
 

@@ -23,7 +23,6 @@ class NoTorch(MetaPathFinder):
 sys.meta_path.insert(0, NoTorch())
 import steadypose.nodes.commands.complete
 import steadypose.nodes.commands.doctor
-import steadypose.nodes.commands.small
 import steadypose.nodes.commands.run
 import steadypose.nodes.commands.small
 import steadypose.nodes.graph.prior_node

@@ -26,8 +26,7 @@ from steadypose.prior.body.skeleton import PARENTS, J, limbs
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import Observation
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.models.occlusion.candidates import CANDIDATES, FEATURES
-from steadypose.prior.models.occlusion.inference import MAX_LOG_SIGMA, MIN_LOG_SIGMA, Occluded, Weighed
+from steadypose.prior.models.occlusion import CANDIDATES, FEATURES, MAX_LOG_SIGMA, MIN_LOG_SIGMA, Occluded, Weighed
 from steadypose.prior.sim.camera import segment_gap
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.prepare import made_once

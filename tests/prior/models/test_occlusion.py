@@ -11,8 +11,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENT, J
 from steadypose.prior.clean.occluded import DENSITIES, FIRST_SPEED, OccludedJoints, Placed, Track, bridge
-from steadypose.prior.models.occlusion.candidates import FEATURES, STANDING
-from steadypose.prior.models.occlusion.inference import SIGMA_SCALE, LiveOcclusion, Occluded, Weighed
+from steadypose.prior.models.occlusion import FEATURES, SIGMA_SCALE, STANDING, LiveOcclusion, Occluded, Weighed
 from steadypose.prior.models.posture import LivePosture
 from steadypose.training.recipes.occlusion import OcclusionConfig, OcclusionNet
 from steadypose.training.weights import arrays_of
