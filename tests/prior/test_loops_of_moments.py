@@ -1,17 +1,20 @@
 """Compiled loops against the same written as array expressions, whichever joints are missing."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.helpers.bodies import waving
 from tests.helpers.values import gated
 
+from steadypose.prior.arrays import medians
 from steadypose.prior.body.skeleton import PARENTS, REST_POSITIONS
 from steadypose.prior.clean import reconstruct, sensor_error
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.reconstruct import Denoise
 from steadypose.prior.clean.sensor_error import DepthError
+from steadypose.prior.compiled import median
 from steadypose.prior.models import posture
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -139,3 +142,21 @@ def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_nois
         np.testing.assert_allclose(found.positions, positions, rtol=1e-12)
         np.testing.assert_allclose(found.sigma, sigmas, rtol=1e-12)
         before = frame
+
+
+@pytest.mark.filterwarnings("ignore:All-NaN slice")
+@pytest.mark.parametrize("count", [1, 2, 7, 22])
+def test_medians_are_numpys_without_what_is_missing(count: int) -> None:
+    rng = np.random.default_rng(count)
+    values = rng.normal(size=(count, 40))
+    values[rng.random(values.shape) < rng.random(40)] = np.nan
+    for axis in (0, 1):
+        assert np.array_equal(medians(values, axis), np.nanmedian(values, axis=axis), equal_nan=True)
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30))
+def test_the_median_of_loops_is_numpys(values: list[float]) -> None:
+    given_ = np.array(values)
+    before = given_.copy()
+    assert median(given_) == np.median(given_)
+    assert np.array_equal(given_, before)

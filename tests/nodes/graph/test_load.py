@@ -1,6 +1,6 @@
 import dataclasses
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -14,6 +14,8 @@ from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Level, Message, PoseRaw
 from steadypose.nodes.checks.stream import AT_ONCE, StreamChecks
 from steadypose.nodes.graph.inbox import CALM_NS, DEADLINE_NS, LONGEST, LOOK_NS, READ_AHEAD, BodyLimit, Inbox
+from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.run_state import Ledger
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import CATCH_UP, PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
@@ -311,3 +313,30 @@ def test_the_inbox_says_whose_frames_it_dropped(clock: VirtualClock) -> None:
     assert inbox.dropped_of(received[1])
     assert not inbox.dropped_of(received[1]), "the frame after it follows on"
     assert not inbox.sources
+
+
+def report(node: str, **values: int) -> Diagnostics:
+    named = {key.replace("__", ".", 1).replace("__", "/"): str(value) for key, value in values.items()}
+    return Diagnostics(0, node, Level.OK, "", named)
+
+
+@pytest.mark.parametrize("lossless", ["true", "false"])
+def test_what_was_dropped_before_a_restart_stays_dropped(make_launch: Callable[..., Launch], lossless: str) -> None:
+    ledger = Ledger(make_launch(transport__lossless=lossless))
+    ledger.note(report("prior", dropped__late=2, count__pose__clean=10), 0)
+    ledger.note(report("prior", dropped__late=3, count__pose__clean=20), 0)
+    after = ledger.note(report("prior", dropped__late=1, count__pose__clean=25), 1)
+    assert after.values["dropped.late"] == "4"
+    # a lossless node counts on itself
+    assert after.values["count.pose/clean"] == {"true": "25", "false": "45"}[lossless]
+
+
+def test_a_live_stream_is_published_for_nobody_while_a_node_is_away(make_launch: Callable[..., Launch]) -> None:
+    ledger = Ledger(make_launch(transport__lossless="false"))
+    reports = {
+        "pose_input": ledger.note(report("pose_input", count__pose__raw=100), 0),
+        "prior": ledger.note(report("prior", in__pose__raw=30, dropped__late=5), 0),
+    }
+    assert not ledger.away("prior", reports), "it is only on its way"
+    reports["prior"] = ledger.note(report("prior", in__pose__raw=40), 1)
+    assert ledger.away("prior", reports) == {"dropped.away pose/raw": "25"}

@@ -1,16 +1,23 @@
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import count, cycle
 
 import numpy as np
 import pytest
-from conftest import START_NS, VirtualClock, listeners, raw, running, until, walking
+from conftest import START_NS, VirtualClock, listeners, raw, repeated, running, until, walk, walking
+from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.publisher import SEND_HIGH_WATER
-from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
-from steadypose.msgs.types import Level, Message, PoseClean, PoseRaw
+from steadypose.msgs.types import EventKind, Level, Message, Phase, PoseClean, PoseEvents, PoseRaw, PoseWorld
 from steadypose.nodes.graph.clock import Timeline
+from steadypose.nodes.graph.events_node import EventsNode, EventStream
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.topology import POSE_NODES, publishers
+from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.prior.events.detector import EventSettings
 
 MakeLaunch = Callable[..., Launch]
 
@@ -185,3 +192,107 @@ def test_input_without_output_is_not_called_running(make_launch: MakeLaunch, clo
         node.health.note_received(POSE_RAW)
         clock.time_ns += 60_000_000_000
         assert node.diagnostics().values["state"] == "running", "nothing comes any more: that is no fault of its own"
+
+
+HOUR_NS = 3_600_000_000_000
+
+
+class SetClock(VirtualClock):
+    """Time whose wall clock can be set."""
+
+    set_ns = START_NS
+
+    def now_ns(self) -> int:
+        return self.time_ns + self.set_ns
+
+
+@pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
+def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_ns: int) -> None:
+    clock, frames = SetClock(), walk(10)
+    node = PoseInputNode(make_launch(), clock, _Source())  # type: ignore[arg-type]
+    for k, frame in enumerate(frames):
+        if k == 5:
+            clock.set_ns += step_ns
+        before = clock.time_ns
+        node.report = lambda: None  # type: ignore[method-assign]
+        node._wait_for(frame.stamp_ns, frame.stamp_ns)
+        assert clock.time_ns - before <= 40_000_000
+        node._tell_pace()
+        assert node.timeline is not None
+        assert abs(node.timeline.wall(frame.stamp_ns) - clock.now_ns()) < 1_000_000
+
+
+class _Source:
+    """In a recording's place: the test itself gives the frames."""
+
+
+class Idle(Node):
+    """A node of the graph that only measures."""
+
+    name = "prior"
+
+    def handle(self, topic: str, message: Message) -> None: ...
+
+
+@pytest.mark.parametrize("step_ns", [10 * 365 * 86400 * 10**9, -(10**9)])
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Launch], step_ns: int, rate: float) -> None:
+    clock = SetClock()
+    node = Idle(make_launch(nodes='["prior"]'), clock)
+    node.timeline = timeline = Timeline(1_000, clock.now_ns(), rate)
+    clock.time_ns += 1_000_000_000
+    stamp_ns = timeline.stamp_at(clock.now_ns()) - round(20_000_000 * rate)
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
+    clock.set_ns += step_ns
+    assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
+
+
+def worlds(seconds: float) -> list[PoseWorld]:
+    return [message for topic, message in messages(seconds) if topic == POSE_WORLD and isinstance(message, PoseWorld)]
+
+
+def test_a_message_is_sent_when_something_changes_and_once_a_second() -> None:
+    stream = EventStream(EventSettings())
+    told = [(world.stamp_ns, stream.process(world)) for world in worlds(6.0)]
+    sent = [(stamp_ns, events) for stamp_ns, events in told if events]
+    assert all(stamp_ns == events.stamp_ns for stamp_ns, events in sent)
+    changed = [any(event.phase != Phase.HOLDS for event in events.events) for _, events in sent]
+    assert any(changed)
+    gaps = np.diff([stamp_ns for stamp_ns, _ in sent]) / 1e9
+    assert gaps.max() < 1.05
+    assert all(gap > 0.95 for gap, changes in zip(gaps, changed[1:], strict=True) if not changes)
+
+
+def test_the_end_of_the_stream_is_passed_on_and_who_comes_after_it_enters() -> None:
+    stream = EventStream(EventSettings())
+    first = worlds(1.0)
+    for world in first:
+        stream.process(world)
+    end = stream.process(PoseWorld(first[-1].stamp_ns, "world", first[-1].source, np.array([0, 0, 1, 0]), [], True))
+    assert end == PoseEvents(first[-1].stamp_ns, "world", first[-1].source, [], True)
+    again = [events for world in worlds(1.0) if (events := stream.process(world))]
+    assert any(event.kind == EventKind.ENTERED for events in again for event in events.events)
+
+
+def test_events_are_off_unless_a_launch_file_has_them(make_launch: Callable[..., Launch]) -> None:
+    assert "events" not in make_launch().nodes
+    assert "events" not in POSE_NODES
+    assert publishers(POSE_EVENTS) == ["events"]
+
+
+def test_the_node_publishes_what_the_trajectory_node_makes_known(make_launch: Callable[..., Launch]) -> None:
+    launch = make_launch(nodes='["trajectory", "events"]', transport__lossless="false")
+    stream, stamps = cycle(worlds(1.0)), count(10**9, 33_333_333)
+    with (
+        Publisher(launch.transport.endpoint("trajectory")) as publisher,
+        running(EventsNode(launch)),
+        Subscriber([launch.transport.endpoint("events")], [POSE_EVENTS]) as subscriber,
+        repeated(lambda: publisher.publish(POSE_WORLD, replace(next(stream), stamp_ns=next(stamps)))),
+    ):
+
+        def stands() -> bool:
+            received = subscriber.receive(0.01)
+            events = received[1].events if received and isinstance(received[1], PoseEvents) else []
+            return any(event.kind == EventKind.STANDS for event in events)
+
+        until(stands)

@@ -18,6 +18,7 @@ from steadypose.prior.clean.fuse import (
     _unseen_of_subtree,
     _weigh,
 )
+from steadypose.prior.clean.occluded import _of_unseen_parts
 
 ELBOW, WRIST, SHOULDER, KNEE, PELVIS = (
     J[name] for name in ("left_elbow", "left_wrist", "left_shoulder", "right_knee", "pelvis")
@@ -145,3 +146,14 @@ def test_what_is_rigid_across_two_bones_varies_by_both() -> None:
     variance = np.arange(22.0)[None]
     for (end, start), found in zip(RIGID, _of_rigid(variance)[0], strict=True):
         assert found == (end if PARENT[end] == start else end + start)
+
+
+def test_a_part_of_which_nothing_was_ever_observed_is_less_certain_than_the_completion_says() -> None:
+    never = np.zeros((2, 22), dtype=bool)
+    for part in ("left_hip", "right_hip", "spine1", "spine2", "left_knee"):
+        never[0, J[part]] = True
+    never[1, J["left_hip"]] = True
+    factors = _of_unseen_parts(never)
+    assert factors[0, J["left_hip"]] == factors[0, J["spine1"]] == 2.0
+    assert factors[0, J["left_knee"]] == 1.0, "its ankle and foot were observed"
+    assert (factors[1] == 1.0).all()

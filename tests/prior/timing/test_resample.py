@@ -4,7 +4,18 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.helpers.bodies import waving
 
-from steadypose.prior.timing.resample import LOOK_AHEAD_NS, MAX_GAP_NS, PERIOD_NS, RUNS, Frame, Republished, Resampler
+from steadypose.prior.sim.noise import time_correlated
+from steadypose.prior.timing.kalman import INITIAL_SPEED, ConstantVelocityFilter
+from steadypose.prior.timing.resample import (
+    LOOK_AHEAD_NS,
+    MAX_GAP_NS,
+    PERIOD_NS,
+    RUNS,
+    DecimationFilter,
+    Frame,
+    Republished,
+    Resampler,
+)
 
 SLOTS = 2
 
@@ -126,3 +137,213 @@ def test_who_stands_still_without_noise_is_no_repetition() -> None:
 def test_a_tracker_that_stops_is_given_on_after_its_usual_repetitions() -> None:
     frames = np.concatenate([np.repeat(waving(60), 2, axis=0), np.repeat(waving(1), 30, axis=0)])
     assert sum(dropped(frames)[120:]) == 1
+
+
+HZ = 60
+
+
+def frames(positions: np.ndarray, hz: float = HZ, jitter_ns: np.ndarray | None = None) -> list[Frame]:
+    """Positions (T, S, 22, 3) at ``hz``, or this much beside."""
+    stamps = np.round(np.arange(len(positions)) * 1e9 / hz).astype(np.int64)
+    if jitter_ns is not None:
+        stamps += jitter_ns
+    confidence = np.ones(positions.shape[1:3])
+    return [Frame(int(t), p, confidence) for t, p in zip(stamps, positions, strict=True)]
+
+
+def through(stream: list[Frame], slots: int = 1) -> list[Frame]:
+    decimation = DecimationFilter(slots, delayed=True)
+    return [out for frame in stream for out in decimation.update(frame)] + decimation.drain()
+
+
+def swing(stamps_ns: np.ndarray, frequency: float = 3.0) -> np.ndarray:
+    """(T, 1, 22, 3): every joint swings by 20 cm."""
+    angle = 2 * np.pi * frequency * stamps_ns * 1e-9
+    return np.broadcast_to(0.2 * np.sin(angle)[:, None, None, None], (len(angle), 1, 22, 3)).copy()
+
+
+@given(
+    st.lists(st.one_of(st.integers(1, 10), st.integers(3_000_000, 60_000_000)), min_size=1, max_size=80),
+    st.sampled_from([None, 1, 8_333_333, 16_666_667]),
+)
+@settings(max_examples=30)
+def test_each_frame_comes_out_once_with_its_stamp(periods: list[int], regular: int | None) -> None:
+    steps = periods if regular is None else [regular] * 40 + periods
+    stamps, rng = np.cumsum(steps), np.random.default_rng(0)
+    stream = [Frame(int(t), rng.standard_normal((1, 22, 3)), np.ones((1, 22))) for t in stamps]
+    out = through(stream)
+    assert [f.stamp_ns for f in out] == stamps.tolist()
+    assert all(np.isfinite(f.positions).all() for f in out)
+
+
+@pytest.mark.parametrize("hz", [10, 15, 30, 40])
+def test_a_stream_no_faster_than_the_grid_passes_at_once_and_untouched(hz: int) -> None:
+    decimation, rng = DecimationFilter(1, delayed=True), np.random.default_rng(0)
+    for frame in frames(rng.standard_normal((60, 1, 22, 3)), hz):
+        (out,) = decimation.update(frame)
+        assert out.stamp_ns == frame.stamp_ns
+        assert np.array_equal(out.positions, frame.positions)
+
+
+@pytest.mark.parametrize(("hz", "left"), [(50, 0.8), (60, 0.8), (90, 0.7), (120, 0.65), (200, 0.55)])
+def test_white_noise_shrinks_with_the_rate(hz: int, left: float) -> None:
+    noise = 0.01 * np.random.default_rng(0).standard_normal((4 * hz, 1, 22, 3))
+    out = np.stack([f.positions for f in through(frames(noise, hz))])[hz:]
+    assert 0.3 < out.std() / 0.01 < left
+
+
+def test_motion_without_noise_stays_within_half_a_millimetre() -> None:
+    truth = swing(np.round(np.arange(3 * HZ) * 1e9 / HZ))
+    out = np.stack([f.positions for f in through(frames(truth))])
+    assert np.abs(out - truth).max() < 5e-4, "3 Hz, 3.8 m/s"
+
+
+def test_stamps_are_believed() -> None:
+    rng = np.random.default_rng(0)
+    jitter = rng.integers(-3_000_000, 3_000_000, 3 * HZ)
+    stamps = np.round(np.arange(3 * HZ) * 1e9 / HZ) + jitter
+    truth = np.broadcast_to((2e-9 * stamps)[:, None, None, None], (3 * HZ, 1, 22, 3))
+    out = np.stack([f.positions for f in through(frames(truth, jitter_ns=jitter))])
+    assert np.allclose(out, truth, atol=1e-9), "a joint at 3.5 m/s, whose stamps jitter"
+
+
+def test_noise_that_lasts_is_left_alone() -> None:
+    noise = time_correlated(0.01 * np.random.default_rng(0).standard_normal((6 * HZ, 1, 22, 3)), 0.98)
+    out = np.stack([f.positions for f in through(frames(noise))])
+    assert 0.97 < out[HZ:].std() / noise[HZ:].std() <= 1.0
+
+
+def test_an_outlier_does_not_reach_its_neighbours() -> None:
+    noise = 0.005 * np.random.default_rng(0).standard_normal((3 * HZ, 1, 22, 3))
+    spoilt = noise.copy()
+    spoilt[2 * HZ, 0, 7] += 0.4
+    clean, out = (np.stack([f.positions for f in through(frames(x))]) for x in (noise, spoilt))
+    off = np.linalg.norm(out - clean, axis=-1)
+    assert off[2 * HZ, 0, 7] > 0.38, "what came is for the gate to judge"
+    off[2 * HZ, 0, 7] = 0.0
+    assert off.max() < 0.02
+
+
+def test_missing_joints_stay_missing_and_harm_no_other() -> None:
+    noise = 0.01 * np.random.default_rng(0).standard_normal((3 * HZ, 2, 22, 3))
+    holed = noise.copy()
+    holed[100:130, 0, 5] = np.nan
+    whole, out = (np.stack([f.positions for f in through(frames(x), slots=2)]) for x in (noise, holed))
+    missing = np.isnan(holed)
+    assert np.array_equal(np.isnan(out), missing)
+    others = np.ones(out.shape[1:3], dtype=bool)
+    others[0, 5] = False
+    assert np.array_equal(out[:, others], whole[:, others])
+
+
+def test_a_cleared_slot_starts_anew() -> None:
+    stream = frames(np.random.default_rng(0).standard_normal((2 * HZ, 2, 22, 3)))
+    decimation = DecimationFilter(2, delayed=True)
+    for frame in stream[:-1]:
+        decimation.update(frame)
+    decimation.clear(np.array([True, False]))
+    (out,) = decimation.update(stream[-1])
+    assert np.isnan(out.positions[0]).all(), "the frame that was held is of the body before"
+    assert np.isfinite(out.positions[1]).all()
+
+
+def test_without_delay_a_frame_waits_for_no_more_than_one_and_only_of_a_fast_camera() -> None:
+    for hz, waits in ((60, 0), (120, 1)):
+        decimation, stream = DecimationFilter(1, delayed=False), frames(np.zeros((60, 1, 22, 3)), hz)
+        passed = [out.stamp_ns for frame in stream for out in decimation.update(frame)]
+        assert passed == [frame.stamp_ns for frame in stream][: 60 - waits]
+
+
+DENSITY, SIGMA = 3.0, 0.02
+
+
+def stream(seed: int, frames: int = 20, joints: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, J, 3) with missing joints, irregular stamps (T,). Joint 0 starts seen."""
+    rng = np.random.default_rng(seed)
+    positions = np.cumsum(rng.normal(0, 0.05, (frames, joints, 3)), axis=0)
+    missing = rng.random((frames, joints)) < 0.3
+    missing[0, 0] = False
+    positions[missing] = np.nan
+    return positions, np.cumsum(rng.uniform(0.01, 0.08, frames))
+
+
+def dense_posterior(values: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, float]:
+    """Mean (3,) and standard deviation along an axis at the end, given all of a path (T, 3), by conditioning one big
+    Gaussian over all positions and velocities. `values[0]` is a measurement; later ones may be NaN."""
+    frames = len(values)
+    mean, covariance = np.zeros((2 * frames, 3)), np.zeros((2 * frames, 2 * frames))
+    mean[0] = values[0]
+    covariance[:2, :2] = np.diag([SIGMA**2, INITIAL_SPEED**2])
+    for i in range(1, frames):
+        dt = stamps[i] - stamps[i - 1]
+        f = np.array([[1, dt], [0, 1]])
+        now, before, past = slice(2 * i, 2 * i + 2), slice(2 * i - 2, 2 * i), slice(0, 2 * i)
+        mean[now] = f @ mean[before]
+        covariance[now, past] = f @ covariance[before, past]
+        covariance[past, now] = covariance[now, past].T
+        covariance[now, now] = f @ covariance[before, before] @ f.T + DENSITY * np.array(
+            [[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]
+        )
+    used = np.flatnonzero(np.isfinite(values[1:, 0])) + 1
+    innovation = covariance[np.ix_(2 * used, 2 * used)] + SIGMA**2 * np.eye(len(used))
+    gain = np.linalg.solve(innovation, covariance[2 * used]).T
+    mean = mean + gain @ (values[used] - mean[2 * used])
+    covariance = covariance - gain @ covariance[2 * used]
+    return mean[-2], np.sqrt(covariance[-2, -2])
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10**6))
+def test_every_estimate_is_the_posterior_given_the_frames_so_far(seed: int) -> None:
+    positions, stamps = stream(seed)
+    kalman = ConstantVelocityFilter(DENSITY, SIGMA)
+    for frame, (measured, stamp) in enumerate(zip(positions, stamps, strict=True)):
+        estimate = kalman.update(measured, stamp)
+        assert estimate.stamp_s == stamp
+        for joint in range(positions.shape[1]):
+            seen = np.isfinite(positions[: frame + 1, joint, 0])
+            if not seen.any():
+                assert np.isnan(estimate.positions[joint]).all()
+                assert estimate.sigma[joint] == np.inf
+                continue
+            span = slice(int(np.argmax(seen)), frame + 1)
+            mean, sigma = dense_posterior(positions[span, joint], stamps[span])
+            np.testing.assert_allclose(estimate.positions[joint], mean, atol=1e-9)
+            np.testing.assert_allclose(estimate.sigma[joint], sigma, atol=1e-9)
+
+
+def test_predict_is_what_a_missing_frame_would_give_and_its_deviation_grows() -> None:
+    positions, stamps = stream(8)
+    kalman = ConstantVelocityFilter(DENSITY)
+    assert kalman.predict(0.0) is None
+    before = [kalman.update(*frame) for frame in zip(positions, stamps, strict=True)][-1]
+    expected = kalman.predict(stamps[-1] + 0.2)
+    coasted = kalman.update(np.full_like(positions[0], np.nan), stamps[-1] + 0.2)
+    assert expected
+    np.testing.assert_array_equal(expected.positions, coasted.positions)
+    np.testing.assert_array_equal(expected.sigma, coasted.sigma)
+    assert (coasted.sigma > before.sigma).all()
+
+
+def test_a_forgotten_joint_starts_anew_and_leaves_the_others_alone() -> None:
+    positions, stamps = stream(9)
+    known, whole, fresh = (ConstantVelocityFilter(DENSITY) for _ in range(3))
+    forgotten = np.array([False, True, False])
+    for i, (measured, stamp) in enumerate(zip(positions, stamps, strict=True)):
+        if i == 12:
+            known.forget(forgotten)
+        a, b = known.update(measured, stamp), whole.update(measured, stamp)
+        np.testing.assert_array_equal(a.positions[~forgotten], b.positions[~forgotten])
+        if i >= 12:
+            c = fresh.update(measured, stamp)
+            np.testing.assert_array_equal(a.positions[1], c.positions[1])
+            np.testing.assert_array_equal(a.sigma[1], c.sigma[1])
+
+
+def test_refuses_a_stamp_that_does_not_increase_until_it_is_reset() -> None:
+    kalman = ConstantVelocityFilter(1.0)
+    kalman.update(np.zeros((2, 3)), 1.0)
+    with pytest.raises(ValueError, match=r"stamp after 1\.0 s"):
+        kalman.update(np.zeros((2, 3)), 1.0)
+    kalman.reset()
+    kalman.update(np.zeros((3, 3)), 0.5)
