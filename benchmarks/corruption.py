@@ -30,12 +30,12 @@ def gaussian(truth: Floats, sigma: float, rng: np.random.Generator) -> Floats:
     return truth + rng.normal(0.0, sigma, truth.shape)
 
 
-def along_sight(truth: Floats, sigma: float, rng: np.random.Generator, ratio: float = 3.0) -> Floats:
+def along_sight(truth: Floats, sigma: float, rng: np.random.Generator) -> Floats:
     """Add independent noise like depth errors: ``sigma`` metres across the line of sight of a camera at the origin, and
-    ``ratio`` times as much along it."""
+    three times as much along it."""
     noise = rng.normal(0.0, sigma, truth.shape)
     sight = truth / np.linalg.norm(truth, axis=-1, keepdims=True)
-    return truth + noise + (ratio - 1) * (noise * sight).sum(axis=-1, keepdims=True) * sight
+    return truth + noise + 2 * (noise * sight).sum(axis=-1, keepdims=True) * sight
 
 
 def correlated(truth: Floats, sigma: float, rng: np.random.Generator, memory: float = 0.9) -> Floats:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 
@@ -22,6 +22,18 @@ def acceleration_error(estimate: Floats, truth: Floats) -> Floats:
     Multiply by fps² for m/s²: at 30 Hz, 1 mm/frame² is 0.9 m/s².
     """
     return np.linalg.norm(np.diff(estimate - truth, n=2, axis=0), axis=-1)
+
+
+def errors_mm(estimate: Floats, truth: Floats) -> dict[str, float]:
+    """Return the mean errors of joints (T, ..., 3) metres, NaN left out: position, mm, and acceleration, mm/frame²."""
+    errors = {"position_mm": position_error(estimate, truth), "acceleration_mm": acceleration_error(estimate, truth)}
+    return {name: mean_mm(values) for name, values in errors.items()}
+
+
+def mean_mm(values: Floats) -> float:
+    """Return the mean of the finite values, metres, in mm; NaN if there is none."""
+    known = values[np.isfinite(values)]
+    return round(1e3 * float(known.mean()), 4) if len(known) else float("nan")
 
 
 def length_variation(positions: Floats, bones: Sequence[tuple[int, int]]) -> float:
@@ -59,29 +71,6 @@ def procrustes(source: Floats, target: Floats) -> Floats:
     rotation = (u * signs[..., None, :]) @ vt  # acts from the right
     scale = (values * signs).sum(axis=-1) / np.maximum((a**2).sum(axis=(-1, -2)), 1e-12)
     return scale[..., None, None] * ((source - middle_a) @ rotation) + middle_b
-
-
-def found_delay(estimate: Floats, truth: Floats, most: int) -> float:
-    """Return the lag of ``estimate`` (T, ..., 3) behind ``truth``, frames: where their velocities correlate best.
-
-    All coordinates are correlated together. A parabola through the best three lags gives fractions of a frame.
-
-    Args:
-        most: largest lag and lead considered, frames.
-    """
-    a, b = (np.diff(x.reshape(len(x), -1), axis=0) for x in (estimate, truth))
-    whole = np.isfinite(a).all(axis=0)
-    a, b = a[:, whole], b[:, whole]
-    lags = np.arange(-most, most + 1)
-    inner = slice(most, len(a) - most)
-    correlation = np.array(
-        [(a[most + lag : len(a) - most + lag] * b[inner]).sum() / np.linalg.norm(a[most + lag : len(a) - most + lag])
-         for lag in lags]
-    )  # fmt: skip
-    best = int(np.clip(correlation.argmax(), 1, len(lags) - 2))
-    left, centre, right = correlation[best - 1 : best + 2]
-    bend = left - 2 * centre + right
-    return float(lags[best] + (0.5 * (left - right) / bend if bend < 0 else 0.0))
 
 
 def sigma_ratio(error: Floats, sigma: Floats) -> float:
@@ -141,22 +130,3 @@ def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right
     left = left - (left * up).sum(axis=-1, keepdims=True) * up
     left = left / np.linalg.norm(left, axis=-1, keepdims=True)
     return np.stack([np.cross(left, up), left, up], axis=-1)
-
-
-def bootstrap(values: ArrayLike, draws: int = 2000, seed: int = 0) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of (N,) values, one per clip, by drawing clips with replacement."""
-    values = np.asarray(values, dtype=np.float64)
-    picks = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
-    low, high = np.quantile(values[picks].mean(axis=1), (0.025, 0.975))
-    return float(low), float(high)
-
-
-def bootstrap_ratio(
-    values: ArrayLike, baseline: ArrayLike, draws: int = 2000, seed: int = 0
-) -> tuple[float, float, float]:
-    """Return the ratio of two means over the same (N,) clips, and its 95 % interval by drawing clips with
-    replacement."""
-    values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
-    picks = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
-    low, high = np.quantile(values[picks].mean(axis=1) / baseline[picks].mean(axis=1), (0.025, 0.975))
-    return float(values.mean() / baseline.mean()), float(low), float(high)

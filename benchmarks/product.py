@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +61,6 @@ class Cleaned:
     """(T', C) whether it was flagged as an anomaly"""
     rotations: Floats
     """(T', C, 22, 4) local, xyzw"""
-
-
-@lru_cache(maxsize=64)
-def available(settings: PriorSettings, delay: int) -> bool:
-    """Whether this variant runs at this delay (up to twice HM-VAE's window)."""
-    try:
-        PriorPipeline(replace(settings, delay=delay))
-    except ValueError:
-        return False
-    return True
 
 
 def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, skeleton: str = "smpl22") -> Cleaned:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.recurrent import _batch_first, _headings, _turned
+from steadypose.benchmarks.baselines.smoothnet import descend, windows
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
@@ -60,23 +61,15 @@ def train(
 ) -> MotionModel:
     """Train to predict the next pose, with a mean square loss."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng((seed, 2))
-    net = MotionModel()
-    optimiser = torch.optim.Adam(net.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-    frames, clips = motion.positions.shape[:2]
-    length = min(_FRAMES, frames)
-    for _ in track(range(steps)):
-        rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
-        truth = _batch_first(_turned(motion.positions[rows, rng.integers(clips, size=_BATCH)], rng))
+    rng, net = np.random.default_rng((seed, 2)), MotionModel()
+
+    def loss() -> Tensor:
+        truth = _batch_first(_turned(motion.positions[windows(motion, _FRAMES, _BATCH, rng)], rng))
         now = truth[:, :-1]
         error = net(now, torch.diff(now, dim=1, prepend=now[:, :1]))[0] - truth[:, 1:]
-        optimiser.zero_grad()
-        (_SCALE * error).square().mean().backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-    return net.eval()
+        return (_SCALE * error).square().mean()
+
+    return descend(net, loss, steps, 3e-3, track)
 
 
 class Bones:

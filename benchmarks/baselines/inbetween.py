@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
+from sklearn.metrics import pairwise_distances_argmin
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading, yaw_matrix
@@ -77,7 +78,7 @@ class NearestWindow:
         facing = heading(self._motion.rotations[windows[:, known[-2]], 0].double().numpy())
         bank = _seen_from(bank, facing)
         query = _seen_from(positions[:, asked], heading(rotations[:, known[-2], 0]))
-        nearest = windows[nearest_rows(query.reshape(len(query), -1), bank.reshape(len(bank), -1))]
+        nearest = windows[pairwise_distances_argmin(query.reshape(len(query), -1), bank.reshape(len(bank), -1))]
         there, there_root = (
             self._motion.rotations[nearest].double().numpy(),
             self._motion.positions[nearest, 0].double().numpy(),
@@ -99,17 +100,6 @@ def _seen_from(joints: Floats, yaw: Floats) -> Floats:
     return (joints - joints[:, -2, None, :1]) @ yaw_matrix(yaw)[:, None]
 
 
-def nearest_rows(query: NDArray[np.floating], bank: NDArray[np.floating], at_once: int = 64) -> NDArray[np.intp]:
-    """Return the row of ``bank`` (N, D) nearest to each ``query`` (Q, D), (Q,)."""
-    bank32 = bank.astype(np.float32)
-    norms = (bank32 * bank32).sum(axis=1)
-    found = [
-        (norms - 2.0 * (query[first : first + at_once].astype(np.float32) @ bank32.T)).argmin(axis=1)
-        for first in range(0, len(query), at_once)
-    ]
-    return np.concatenate(found)
-
-
 class NearestPose:
     """Fills always hidden parts of a body from the training window nearest in the other joints."""
 
@@ -128,8 +118,8 @@ class NearestPose:
         """
         seen = np.setdiff1d(np.arange(22), hidden)
         query = _about_root(positions[:, :: self.EVERY], truth_yaw)[:, :, seen]
-        rows = nearest_rows(query.reshape(len(query), -1), self._bank[:, :, seen].reshape(len(self._bank), -1))
-        windows = self._windows[rows]
+        bank = self._bank[:, :, seen].reshape(len(self._bank), -1)
+        windows = self._windows[pairwise_distances_argmin(query.reshape(len(query), -1), bank)]
         facing = heading(self._motion.rotations[windows[:, 0], 0].double().numpy())
         there = _about_root(self._motion.positions[windows].double().numpy(), facing)
         back = there @ yaw_matrix(truth_yaw).swapaxes(-1, -2)[:, None] + positions[:, :, :1]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
-from steadypose.benchmarks.baselines.smoothnet import corrupt
+from steadypose.benchmarks.baselines.smoothnet import corrupt, descend, windows
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
@@ -61,24 +61,14 @@ def train(
 ) -> RecurrentDenoiser:
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng((seed, 1))
-    net = RecurrentDenoiser(delays)
-    optimiser = torch.optim.Adam(net.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-    frames, clips = motion.positions.shape[:2]
-    length = min(_FRAMES, frames)
-    for _ in track(range(steps)):
-        rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
-        truth = _turned(motion.positions[rows, rng.integers(clips, size=_BATCH)], rng)
-        wanted = net.at_delay(_batch_first(truth))
-        error = net(*_inputs(corrupt(truth, rng))) - wanted
-        loss = error.abs().mean() + error.diff(n=2, dim=1).abs().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-    return net.eval()
+    rng, net = np.random.default_rng((seed, 1)), RecurrentDenoiser(delays)
+
+    def loss() -> Tensor:
+        truth = _turned(motion.positions[windows(motion, _FRAMES, _BATCH, rng)], rng)
+        error = net(*_inputs(corrupt(truth, rng))) - net.at_delay(_batch_first(truth))
+        return error.abs().mean() + error.diff(n=2, dim=1).abs().mean()
+
+    return descend(net, loss, steps, 3e-3, track)
 
 
 @torch.inference_mode()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.recurrent import _batch_first, _headings, _inputs
-from steadypose.benchmarks.baselines.smoothnet import corrupt
+from steadypose.benchmarks.baselines.smoothnet import corrupt, descend, windows
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations
@@ -95,26 +95,16 @@ def train_rotations(
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(0)
     rng, net = np.random.default_rng(1), RotationNet(joints, lag)
-    optimiser = torch.optim.Adam(net.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=steps)
-    frames, clips = motion.positions.shape[:2]
-    length = min(_FRAMES, frames)
-    truth = global_rotations(motion.rotations.reshape(-1, 22, 3, 3))[:, net.joints]
-    truth = truth.reshape(frames, clips, len(net.joints), 3, 3)
-    for _ in track(range(steps)):
-        rows = rng.integers(frames - length, endpoint=True, size=_BATCH) + np.arange(length)[:, None]
-        picked = rng.integers(clips, size=_BATCH)
+    truth = global_rotations(motion.rotations)[:, :, net.joints]
+
+    def loss() -> Tensor:
+        picked = windows(motion, _FRAMES, _BATCH, rng)
         spun = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (_BATCH, 1))).as_matrix()
-        seen = corrupt(np.einsum("bij,tbkj->tbki", spun, motion.positions[rows, picked]), rng)
-        wanted = _batch_first(spun[:, None] @ truth[rows, picked])
-        found = net(*_inputs(seen))
-        loss = (found[:, lag:] - wanted[:, : length - lag]).abs().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-    return net.eval()
+        seen = corrupt(np.einsum("bij,tbkj->tbki", spun, motion.positions[picked]), rng)
+        wanted = _batch_first(spun[:, None] @ truth[picked])
+        return (net(*_inputs(seen))[:, lag:] - wanted[:, : wanted.shape[1] - lag]).abs().mean()
+
+    return descend(net, loss, steps, 3e-3, track)
 
 
 @torch.inference_mode()

@@ -9,9 +9,11 @@ every delay: for a delay of k, the output is the frame k before the newest of th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
@@ -51,24 +53,41 @@ def train(
 ) -> SmoothNet:
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng((seed, 1))
-    net = SmoothNet()
+    rng, net = np.random.default_rng((seed, 1)), SmoothNet()
+
+    def loss() -> Tensor:
+        truth = motion.positions[windows(motion, WINDOW, _BATCH, rng)]
+        error = net(*_inputs(corrupt(truth, rng))) - torch.from_numpy(np.moveaxis(truth, 0, -1)).float()
+        return error.abs().mean() + error.diff(n=2, dim=-1).abs().mean()
+
+    return descend(net, loss, steps, 1e-2, track)
+
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def descend(
+    net: Network, loss: Callable[[], Tensor], steps: int, rate: float, track: Callable[[Iterable[int]], Iterable[int]]
+) -> Network:
+    """Minimise ``loss()`` by Adam, with one cycle of learning rates up to ``rate`` and clipped gradients."""
     optimiser = torch.optim.Adam(net.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2, total_steps=steps)
-    frames, clips = motion.positions.shape[:2]
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
     for _ in track(range(steps)):
-        rows = rng.integers(frames - WINDOW, endpoint=True, size=_BATCH) + np.arange(WINDOW)[:, None]
-        truth = motion.positions[rows, rng.integers(clips, size=_BATCH)]
-        held, gone = _inputs(corrupt(truth, rng))
-        wanted = torch.from_numpy(np.moveaxis(truth, 0, -1)).float()
-        answer = net(held, gone)
-        position = (answer - wanted).abs().mean()
-        acceleration = (answer - wanted).diff(n=2, dim=-1).abs().mean()
+        found = loss()
         optimiser.zero_grad()
-        (position + acceleration).backward()
+        found.backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimiser.step()
         schedule.step()
     return net.eval()
+
+
+def windows(motion: MotionClips, length: int, count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """Return the frames (T, N) and clips (N,) of random windows of at most ``length`` frames."""
+    frames, clips = motion.positions.shape[:2]
+    length = min(length, frames)
+    rows = rng.integers(frames - length, endpoint=True, size=count) + np.arange(length)[:, None]
+    return rows, rng.integers(clips, size=count)
 
 
 @torch.inference_mode()

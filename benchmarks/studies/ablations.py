@@ -142,9 +142,9 @@ def run(bench: Bench) -> Result:
         for name, part in bench.progress.track(PARTS.items(), description=condition):
             with part.replaced():
                 answer = product.run(part.settings, seen, clips.stamps_s, DELAY).positions
-            found = score(answer, clips.positions, hidden, align=False)
+            found = score(answer, clips.positions, hidden)
             errors = found.hidden if hidden.any() else found.position
-            records.append(_record(condition, name, errors, found.acceleration_error))
+            records.append(_record(condition, name, errors, found.acceleration))
     flags = _flags(bench, clips)
     world, world_cost = _world(bench, clips), world_costs(clips)
     tables = [
@@ -187,8 +187,8 @@ def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
     records = []
     for name, settings in bench.progress.track(PARTS_OF_THE_WORLD.items(), description="world"):
         answer = chain(PriorSettings(), seen, clips.stamps_s, settings)[1]
-        found = score(answer, clips.positions, missing(seen), align=False)
-        record = _record("lasting 2 cm", name, found.position, found.acceleration_error)
+        found = score(answer, clips.positions, missing(seen))
+        record = _record("lasting 2 cm", name, found.position, found.acceleration)
         feet = measure(clips, answer)
         record["standing_feet_m_s"] = round(0.5 * (feet["left_skate_m_s"] + feet["right_skate_m_s"]), 4)
         records.append(record)

@@ -23,7 +23,6 @@ from steadypose.benchmarks.metrics import procrustes
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.scores import ends_mm
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import heading, rotation_matrices, yaw_matrix
@@ -101,7 +100,6 @@ def run(bench: Bench) -> Result:
             records.append(
                 {
                     "hidden": part, "method": name, "hidden_mm": round(float(error.mean()) * 1e3, 2),
-                    "hidden_ci_mm": ends_mm(error, clips.person),
                     "acceleration_of_true": round(float(bends[0] / bends[1]), 3),
                 }
             )  # fmt: skip

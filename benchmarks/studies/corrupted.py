@@ -8,22 +8,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.benchmarks.baselines.filters import BASELINES, OFFLINE, Baseline, missing
-from steadypose.benchmarks.bench import RECURRENT, Answer, Bench, Methods, answers, over_seeds, tune, tuning_log
-from steadypose.benchmarks.intervals import ratio
+from steadypose.benchmarks.baselines.filters import BASELINES, Baseline, missing
+from steadypose.benchmarks.bench import (
+    RECURRENT,
+    TUNED_ON,
+    Answer,
+    Bench,
+    Methods,
+    answers,
+    over_seeds,
+    tune_on,
+    tuning_log,
+)
 from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
-from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.results import Table
 from steadypose.benchmarks.scores import Scores, figures, pivot, score, source_table
 from steadypose.prior.arrays import Floats
 
 Condition = Callable[[Floats, np.random.Generator], Floats]
 """Maps true joints (T, C, 22, 3) to observed ones."""
-
-TUNED_ON = 3
-"""Step between the clips on which baselines are tuned. They are among the clips that are scored, with other noise,
-which favours the baselines."""
 
 HOW = (
     "Baselines are tuned on every third of these clips with other noise, each with the same number of evaluations, for "
@@ -55,80 +59,41 @@ def run_conditions(
 ) -> dict[str, Any]:
     """Run every method in every condition; return records, calibration and the evaluated parameters.
 
-    Records have ``condition``, ``method``, ``delay``, and `figures`. If a baseline runs at their delay, steadypose's
-    records also have the ratio of their errors to those of the best such baseline.
+    Records have ``condition``, ``method``, ``delay``, and `figures`.
     """
     records: list[dict[str, Any]] = []
     calibration: list[dict[str, Any]] = []
     tried: dict[str, Any] = {}
+    some = clips.every(TUNED_ON)
     for number, (name, corrupt) in enumerate(conditions.items()):
-        some = clips.every(TUNED_ON)
-        tuning_observed = corrupt(some.positions, np.random.default_rng((number, 1)))
-
-        def evaluate(
-            baseline: Baseline,
-            delay: int,
-            parameters: Mapping[str, float],
-            truth: Floats = some.positions,
-            tuning_observed: Floats = tuning_observed,
-        ) -> dict[str, float]:
-            answer = baseline.run(tuning_observed, clips.stamps_s, delay, **parameters)
-            found = figures(score(answer, truth, missing(tuning_observed), align=False))
-            return {key: found[key] for key in ("position_mm", "acceleration_mm")}
-
-        tuned = tune(bench, evaluate, name, baselines)
+        other = corrupt(some.positions, np.random.default_rng((number, 1)))
+        tuned = tune_on(bench, other, some.positions, clips.stamps_s, name, baselines)
         tried[name] = tuning_log(tuned)
         seen = corrupt(clips.positions, np.random.default_rng((number, 0)))
         hidden = missing(seen)
-        scored: list[tuple[Answer, Scores]] = []
+        scored: list[dict[str, Any]] = []
         for answer in answers(bench, seen, clips.stamps_s, tuned, name, Methods.all(bench, baselines)):
-            scored.append((answer, score(answer.positions, clips.positions, hidden)))
+            scored.append(_record(name, answer, score(answer.positions, clips.positions, hidden)))
             if answer.sigma is not None:
                 error = position_error(answer.positions, clips.positions)
                 row = {"condition": name, "method": answer.method, "delay": answer.delay}
                 calibration.append({**row, **_calibration(error, answer.sigma, hidden)})
-        records += over_seeds([_record(name, *one, scored, clips.person) for one in scored])
+        records += over_seeds(scored)
     return {"records": records, "calibration": calibration, "tuning": tried}
 
 
-def _record(
-    condition: str, answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
-) -> dict[str, Any]:
+def _record(condition: str, answer: Answer, scores: Scores) -> dict[str, Any]:
     record: dict[str, Any] = {
         "condition": condition,
         "method": answer.method,
         "delay": answer.delay,
         "parameters": dict(answer.parameters),
-        **figures(scores, people),
+        **figures(scores),
     }
     if answer.method in BY_SOURCE:
         by_clip = {"position": scores.position, "hidden": scores.hidden}
         record["clips_mm"] = {key: np.round(1e3 * values, 3).tolist() for key, values in by_clip.items()}
-    if answer.method in PRODUCT:
-        record["against_best_baseline"] = against_best(answer, scores, scored, people)
     return record
-
-
-def against_best(
-    answer: Answer, scores: Scores, scored: Sequence[tuple[Answer, Scores]], people: NDArray[np.str_]
-) -> dict[str, Any]:
-    """Return ratios of errors, with their 95 % intervals over people, to the best baseline that needs no longer delay.
-
-    The best baseline is the one with the least error of that kind, so it may differ between errors.
-    """
-    rivals = [(a, s) for a, s in scored if a.method not in PRODUCT and a.delay <= answer.delay and a.delay != OFFLINE]
-    ratios: dict[str, Any] = {}
-    for name in ("position", "seen", "hidden", "acceleration_error"):
-        mine = getattr(scores, name)
-        usable = [(a, getattr(s, name)) for a, s in rivals]
-        known = np.isfinite(mine)
-        # a baseline without an estimate for some joints does not count as the best
-        usable = [(a, theirs) for a, theirs in usable if known.any() and np.isfinite(theirs[known]).all()]
-        if usable:
-            rival, theirs = min(usable, key=lambda pair: float(pair[1][known].mean()))
-            found = ratio(mine, theirs, people)[:3]
-            ratios[name] = {"baseline": f"{rival.method}, delay {rival.delay}", "ratio": [round(v, 4) for v in found]}
-    return ratios
 
 
 def _calibration(error: Floats, sigma: Floats, hidden: NDArray[np.bool_]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ method that does not know it. So each clip is also scored with its own offset.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 
+from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import (
     acceleration_error,
     body_frame,
-    bootstrap,
     length_variation,
     position_error,
     sigma_ratio,
@@ -46,17 +45,6 @@ BONES = tuple(
     for side in ("left", "right")
     for a, b in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 )
-MARKERS = {
-    "head": ("LFHD", "RFHD", "LBHD", "RBHD"),
-    **{f"{side}_shoulder": (f"{s}SHO",) for side, s in (("left", "L"), ("right", "R"))},
-    **{f"{side}_elbow": (f"{s}ELB",) for side, s in (("left", "L"), ("right", "R"))},
-    **{f"{side}_wrist": (f"{s}WRA", f"{s}WRB") for side, s in (("left", "L"), ("right", "R"))},
-    **{f"{side}_hip": (f"{s}ASI",) for side, s in (("left", "L"), ("right", "R"))},
-    **{f"{side}_knee": (f"{s}KNE",) for side, s in (("left", "L"), ("right", "R"))},
-    **{f"{side}_ankle": (f"{s}ANK",) for side, s in (("left", "L"), ("right", "R"))},
-}
-"""The skin markers nearest to each joint: a second truth, for comparison with work that did not compute joint
-centres."""
 
 
 class Clip(NamedTuple):
@@ -67,22 +55,17 @@ class Clip(NamedTuple):
     kinect: Floats  # (T, 22, 3) metres, skeleton kinect22, z up
     raw: Floats  # (T, 13, 3) metres, its scored joints
     centres: Floats  # (T, 13, 3) metres, the truth
-    markers: Floats  # (T, 13, 3) metres, the other truth
 
 
 def read_clips(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
     """Read every n-th clip of each of these subjects."""
-    with np.load(path) as archive:
-        marker_names = [str(name) for name in archive["vicon_names"]]
-    return [_clip(pair, marker_names) for subject in subjects for pair in load_pairs(path, (subject,))[::every]]
+    return [_clip(pair) for subject in subjects for pair in load_pairs(path, (subject,))[::every]]
 
 
-def _clip(pair: KinectPair, marker_names: Sequence[str]) -> Clip:
+def _clip(pair: KinectPair) -> Clip:
     scored = [J[name] for name in SCORED]
-    markers = [pair.markers[:, [marker_names.index(m) for m in MARKERS[name]]].mean(axis=1) for name in SCORED]
     raw = to_canonical(KINECT22, pair.kinect)[0][:, scored]
-    centres, skin = pair.vicon[:, scored], np.stack(markers, axis=1)
-    return Clip(pair.name, pair.subject, pair.kinect, raw, centres, skin)
+    return Clip(pair.name, pair.subject, pair.kinect, raw, pair.vicon[:, scored])
 
 
 def side_by_side(clips: Sequence[Floats]) -> Floats:
@@ -99,15 +82,13 @@ WORST = 0.1
 """Share of frames, the worst by mean error, that the anomaly should indicate."""
 
 
-@dataclass(frozen=True)
-class Scores:
+class Scores(NamedTuple):
     """Scores of a method, one number per clip."""
 
     position: Floats  # (C,) metres
     moving: Floats  # (C,) metres, with this clip's own offset: the part of the error that changes with the pose
     acceleration: Floats  # (C,) metres/frame²
     variation: Floats  # (C,) of bone lengths, relative
-    joints: Floats  # (13,) metres, mean over the frames of all clips
 
 
 def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
@@ -119,20 +100,12 @@ def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
 
 def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -> Scores:
     """Score each clip's aligned estimate, moved by the offset."""
-    errors, moving, acceleration, variation = [], [], [], []
+    found = []
     for truth, estimate in zip(truths, aligned, strict=True):
-        placed = move(estimate, offset)
-        errors.append(position_error(placed, truth))
-        moving.append(np.nanmean(position_error(move(estimate, learn_offset([truth], [estimate])), truth)))
-        acceleration.append(np.nanmean(acceleration_error(placed, truth)))
-        variation.append(length_variation(estimate, BONES))
-    return Scores(
-        position=np.array([np.nanmean(error) for error in errors]),
-        moving=np.array(moving),
-        acceleration=np.array(acceleration),
-        variation=np.array(variation),
-        joints=np.nanmean(np.concatenate(errors), axis=0),
-    )
+        placed, own = move(estimate, offset), move(estimate, learn_offset([truth], [estimate]))
+        errors = position_error(placed, truth), position_error(own, truth), acceleration_error(placed, truth)
+        found.append((*map(np.nanmean, errors), length_variation(estimate, BONES)))
+    return Scores(*np.array(found).T)
 
 
 def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]:
@@ -167,40 +140,18 @@ def _mm(values: Floats) -> float:
 
 
 def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
-    """Return a method's figures: mm, mm/frame², per cent; of all, of each subject, and of movements done wrong.
+    """Return a method's figures: mm, mm/frame², per cent, with 95 % intervals over people; and each subject's position.
 
-    Subjects `OUT_OF_STEP` have figures of their own, and are left out of all others.
+    Subjects `OUT_OF_STEP` are left out of all means.
     """
-    kept, subject = in_step(clips), np.array([clip.subject for clip in clips])
-    wrong = np.array([clip.name.endswith("_inc") for clip in clips])
-    groups = {who: subject == who for who in dict.fromkeys(subject.tolist())}
-    groups |= {"done right": kept & ~wrong, "done wrong": kept & wrong}
-    return {
-        **{
-            figure: value
-            for name in ("position", "moving", "acceleration")
-            for figure, value in (
-                (f"{name}_mm", _mm(getattr(scores, name)[kept])),
-                (f"{name}_ci_mm", [round(v * 1000, 3) for v in bootstrap(getattr(scores, name)[kept])]),
-            )
-        },
-        "bone_variation_percent": round(float(scores.variation[kept].mean()) * 100, 3),
-        "joints_mm": dict(zip(SCORED, np.round(scores.joints * 1000, 2).tolist(), strict=True)),
-        "groups": {
-            name: {
-                "position_mm": _mm(scores.position[mask]),
-                "moving_mm": _mm(scores.moving[mask]),
-                "acceleration_mm": _mm(scores.acceleration[mask]),
-            }
-            for name, mask in groups.items()
-            if mask.any()
-        },
-    }
-
-
-def in_step(clips: Sequence[Clip]) -> NDArray[np.bool_]:
-    """Return which clips (C,) are of people whose two systems are synchronised; means are taken over these."""
-    return np.array([clip.subject not in OUT_OF_STEP for clip in clips])
+    subject = np.array([clip.subject for clip in clips])
+    kept = ~np.isin(subject, OUT_OF_STEP)
+    found: dict[str, Any] = {"bone_variation_percent": round(float(scores.variation[kept].mean()) * 100, 3)}
+    for name in ("position", "moving", "acceleration"):
+        values = getattr(scores, name)
+        found[f"{name}_mm"] = _mm(values[kept])
+        found[f"{name}_ci_mm"] = [round(1e3 * end, 3) for end in interval(values[kept], subject[kept])[1:3]]
+    return found | {"people_mm": {str(who): _mm(scores.position[subject == who]) for who in np.unique(subject)}}
 
 
 def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:

@@ -25,13 +25,12 @@ from typing import Any
 import numpy as np
 
 from steadypose.benchmarks import figures
-from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE
-from steadypose.benchmarks.bench import Bench, loss, over_seeds, tuning_log
-from steadypose.benchmarks.metrics import bootstrap_ratio, length_variation, position_error, reliability
+from steadypose.benchmarks.baselines.filters import OFFLINE
+from steadypose.benchmarks.bench import Bench, over_seeds, tuning_log
+from steadypose.benchmarks.metrics import position_error, reliability
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.kinect_clips import (
-    BONES,
     OUT_OF_STEP,
     SCORED,
     SUBJECTS,
@@ -39,14 +38,13 @@ from steadypose.benchmarks.studies.kinect_clips import (
     Scores,
     align,
     deviation,
-    in_step,
     learn_offset,
     move,
     read_clips,
     score,
     summary,
 )
-from steadypose.benchmarks.studies.kinect_methods import KNOWN, TCN, UNKNOWN, Kinect, Method, Stated
+from steadypose.benchmarks.studies.kinect_methods import KNOWN, UNKNOWN, Kinect, Method, Stated
 from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
 
@@ -74,19 +72,25 @@ def run(bench: Bench) -> Result:
         others = [clip for clip in clips if clip.subject != person][:: 1 if bench.quick else OFFSET_CLIPS]
         runs: dict[tuple[str, int], int] = {}
         for method in kinect.methods(person, tuned):
-            result, skin, error, stated = _scored(method, asked, others)
+            result, error, stated = _scored(method, asked, others)
             key = (method.name, method.delay)
             runs[key] = runs.get(key, -1) + 1  # networks of several seeds share one name
-            parts.setdefault((*key, runs[key]), []).append((result, {
-                "parameters": dict(method.parameters), "markers_mm": round(1e3 * float(skin.position.mean()), 3),
-            }))  # fmt: skip
+            parts.setdefault((*key, runs[key]), []).append((result, dict(method.parameters)))
             if stated is not None:
                 sigma, anomaly, flagged = (np.concatenate(part) for part in zip(*stated, strict=True))
                 deviations.setdefault(key, {})[person] = deviation(error, sigma, anomaly, flagged)
                 bins.setdefault(f"{method.name}, delay {method.delay}", []).append((error, sigma))
-    ordered = [clip for person in subjects for clip in clips if clip.subject == person]
-    scored = {key: _together([s for s, _ in some], subjects) for key, some in parts.items()}
-    records = over_seeds([_record(key, ordered, scored, parts[key], deviations) for key in scored])
+    records = over_seeds(
+        [
+            {
+                "method": name, "delay": delay,
+                **summary(clips, Scores(*map(np.concatenate, zip(*(scores for scores, _ in some), strict=True)))),
+                "parameters": {who: parameters for who, (_, parameters) in zip(subjects, some, strict=True)},
+                **({"deviation": deviations[name, delay]} if (name, delay) in deviations else {}),
+            }
+            for (name, delay, _), some in parts.items()
+        ]
+    )  # fmt: skip
     reliabilities = {
         name: reliability(np.concatenate([error for error, _ in some]), np.concatenate([sigma for _, sigma in some]))
         for name, some in bins.items()
@@ -96,9 +100,6 @@ def run(bench: Bench) -> Result:
             "file": path.name, "people": subjects, "clips": len(clips), "learning_clips": len(taught),
             "joints": SCORED, "fps": FPS, "out of step, in no mean": OUT_OF_STEP,
         },
-        "truth_bone_variation_percent": round(
-            100 * float(np.mean([length_variation(clip.centres, BONES) for clip in clips])), 3
-        ),
         "records": records, "reliability": reliabilities, "tuning": tuning_log(tuned),
     }  # fmt: skip
     pictures = {
@@ -109,131 +110,22 @@ def run(bench: Bench) -> Result:
         ),
         "kinect_reliability": figures.reliability(reliabilities, "Real Kinect: stated and found"),
     }  # fmt: skip
-    tables = [
-        _summary(records, bench.delays), _moving(records, bench.delays), _table(records, clips, subjects),
-        _deviation_table(deviations, subjects),
-    ]  # fmt: skip
-    return Result(tables, data, pictures)
+    return Result([_table(records, clips, subjects), _deviation_table(deviations, subjects)], data, pictures)
 
 
 def _scored(
     method: Method, asked: Sequence[Clip], others: Sequence[Clip]
-) -> tuple[Scores, Scores, Floats, list[Stated] | None]:
-    """Score one person's clips against joint centres and markers; return errors (N, 13) and steadypose's
-    predictions."""
+) -> tuple[Scores, Floats, list[Stated] | None]:
+    """Score one person's clips; also return errors (N, 13) and steadypose's predictions."""
     answers, stated = method.run([*others, *asked])
-    found: list[tuple[Scores, Floats]] = []
-    for truth in ("centres", "markers"):
-        known, wanted = ([getattr(clip, truth) for clip in part] for part in (others, asked))
-        offset = learn_offset(known, align(known, answers[: len(others)]))
-        aligned = align(wanted, answers[len(others) :])
-        error = [position_error(move(a, offset), t) for a, t in zip(aligned, wanted, strict=True)]
-        found.append((score(wanted, aligned, offset), np.concatenate(error)))
-    return found[0][0], found[1][0], found[0][1], None if stated is None else stated[len(others) :]
-
-
-def _together(scores: Sequence[Scores], people: Sequence[str]) -> Scores:
-    """Merge the scores of several people's clips; joints are the mean over people whose systems are synchronised."""
-    return Scores(
-        position=np.concatenate([s.position for s in scores]),
-        moving=np.concatenate([s.moving for s in scores]),
-        acceleration=np.concatenate([s.acceleration for s in scores]),
-        variation=np.concatenate([s.variation for s in scores]),
-        joints=np.mean([s.joints for s, who in zip(scores, people, strict=True) if who not in OUT_OF_STEP], axis=0),
-    )
-
-
-def _record(
-    key: tuple[str, int, int],
-    clips: Sequence[Clip],
-    scored: Mapping[tuple[str, int, int], Scores],
-    parts: Sequence[tuple[Scores, dict[str, Any]]],
-    deviations: Mapping[tuple[str, int], dict[str, Any]],
-) -> dict[str, Any]:
-    name, delay, _ = key
-    people = list(dict.fromkeys(clip.subject for clip in clips))
-    record: dict[str, Any] = {
-        "method": name, "delay": delay, **summary(clips, scored[key]),
-        "parameters": {person: extra["parameters"] for person, (_, extra) in zip(people, parts, strict=True)},
-        "markers_mm": {person: extra["markers_mm"] for person, (_, extra) in zip(people, parts, strict=True)},
-    }  # fmt: skip
-    if (name, delay) in deviations:
-        record["deviation"] = deviations[name, delay]
-        record["ratios"] = _ratios(scored[key], delay, clips, scored)
-    return record
-
-
-def _ratios(
-    mine: Scores, delay: int, clips: Sequence[Clip], scored: Mapping[tuple[str, int, int], Scores]
-) -> dict[str, Any]:
-    """Return ratios of errors to the best filter up to this delay (least sum of errors) and to the temporal
-    convolution.
-
-    They have intervals over all synchronised clips, and position for each person.
-    """
-    kept = in_step(clips)
-    names = {baseline.name for baseline in FILTERS}
-    filters = {k: s for k, s in scored.items() if k[0] in names and OFFLINE < k[1] <= delay}
-
-    def both(scores: Scores) -> float:
-        mean = {"position_mm": scores.position[kept], "acceleration_mm": scores.acceleration[kept]}
-        return loss({name: 1e3 * float(values.mean()) for name, values in mean.items()})
-
-    best = min(filters, key=lambda k: both(filters[k]))
-    of_person = {p: np.array([clip.subject == p for clip in clips]) for p in dict.fromkeys(c.subject for c in clips)}
-
-    def ratio(name: str, rival: Scores) -> list[float]:
-        return [round(v, 4) for v in bootstrap_ratio(getattr(mine, name)[kept], getattr(rival, name)[kept])]
-
-    return {
-        f"{rival[0]}, delay {rival[1]}": {
-            **{name: ratio(name, scored[rival]) for name in ("position", "moving", "acceleration")},
-            "position of each": {
-                p: round(float(mine.position[rows].mean() / scored[rival].position[rows].mean()), 4)
-                for p, rows in of_person.items()
-            },
-        }
-        for rival in (best, (TCN, delay, 0))
-        if rival in scored
-    }
+    known, wanted = ([clip.centres for clip in part] for part in (others, asked))
+    offset = learn_offset(known, align(known, answers[: len(others)]))
+    aligned = align(wanted, answers[len(others) :])
+    error = [position_error(move(a, offset), t) for a, t in zip(aligned, wanted, strict=True)]
+    return score(wanted, aligned, offset), np.concatenate(error), None if stated is None else stated[len(others) :]
 
 
 _NO_MEAN = f"{', '.join(OUT_OF_STEP)}, whose Kinect is out of step with the Vicon, is in no mean"
-
-
-def _summary(records: Sequence[dict[str, Any]], delays: Sequence[int]) -> Table:
-    return _by_delay(
-        records, delays, "position_mm", "kinect_vicon-summary",
-        "Real Kinect against Vicon: position error, mm / acceleration error, mm/frame²",
-        "UI-PRMD, each of eight people left out in turn: offsets, tuning, training and the sensor's correction are "
-        f"the others'. {_NO_MEAN}. Details: docs/results.md.",
-    )  # fmt: skip
-
-
-def _moving(records: Sequence[dict[str, Any]], delays: Sequence[int]) -> Table:
-    return _by_delay(
-        records, delays, "moving_mm", "kinect_vicon-moving",
-        "Real Kinect against Vicon, each joint's constant offset of that clip taken off: position error, mm / "
-        "acceleration error, mm/frame²",
-        f"What differs between persons and definitions all the time is no matter of cleaning. {_NO_MEAN}.",
-    )  # fmt: skip
-
-
-def _by_delay(
-    records: Sequence[dict[str, Any]], delays: Sequence[int], figure: str, name: str, title: str, note: str
-) -> Table:
-    """Build a table with a row for each method and a column for each delay."""
-    cells: dict[str, dict[int, str]] = {}
-    for record in records:
-        cell = f"{record[figure]:.1f} / {record['acceleration_mm']:.2f}"
-        cells.setdefault(record["method"], {})[record["delay"]] = cell
-    return Table(
-        name=name,
-        title=title,
-        columns=["method", *(f"delay {delay}" for delay in delays), "offline"],
-        rows=[[method, *(found.get(delay, "") for delay in (*delays, OFFLINE))] for method, found in cells.items()],
-        note=note,
-    )
 
 
 def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: Sequence[str]) -> Table:
@@ -243,11 +135,11 @@ def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: S
         {"method": "{method}", "delay, frames": "{delay}",
          "position, mm": "{position_mm:.1f} ({position_ci_mm[0]:.1f}–{position_ci_mm[1]:.1f})",
          "clip's offset off": "{moving_mm:.1f} ({moving_ci_mm[0]:.1f}–{moving_ci_mm[1]:.1f})",
-         **{subject: f"{{groups[{subject}][position_mm]:.1f}}" for subject in subjects},
+         **{subject: f"{{people_mm[{subject}]:.1f}}" for subject in subjects},
          "acceleration, mm/frame²":
              "{acceleration_mm:.2f} ({acceleration_ci_mm[0]:.2f}–{acceleration_ci_mm[1]:.2f})",
          "bone length, %": "{bone_variation_percent:.1f}"},
-        f"{len(clips)} clips, 13 joints, 30 Hz; in brackets, the 95 % interval by bootstrap over clips. One "
+        f"{len(clips)} clips, 13 joints, 30 Hz; in brackets, the 95 % interval over people. One "
         "rotation and translation a clip, then a constant offset a joint in the trunk's frame, which every method "
         "learns on the other people. Filters have the parameters that are best for the others, of one search. "
         "Bone length: standard deviation by mean. Clip's offset off: without each joint's constant offset of that "

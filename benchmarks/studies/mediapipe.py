@@ -16,7 +16,7 @@ import numpy as np
 
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
-from steadypose.benchmarks.metrics import acceleration_error, position_error
+from steadypose.benchmarks.metrics import errors_mm
 from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result
@@ -67,10 +67,7 @@ def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
     rotation, _ = rigid_alignment(own, wanted)
     turned = own @ rotation.T
     turned = turned + np.nanmean(wanted - turned, axis=0)
-    return {
-        "position_mm": 1e3 * float(np.nanmean(position_error(turned, wanted))),
-        "acceleration_mm": 1e3 * float(np.nanmean(acceleration_error(turned, wanted))),
-    }
+    return errors_mm(turned, wanted)
 
 
 def run(bench: Bench) -> Result:

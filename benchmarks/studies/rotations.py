@@ -107,11 +107,6 @@ def run(bench: Bench) -> Result:
             record: dict[str, Any] = {"method": method, "noise": condition}
             for against, truth in (("noise alone", own), ("file", align(clips.orientations, own))):
                 record[against] = score(found.orientations[scored], truth[scored], clips.positions[scored])
-                record[against]["sources"] = {
-                    source: score(*(part[scored][:, clips.source == source]
-                                    for part in (found.orientations, truth, clips.positions)))["all"]
-                    for source in np.unique(clips.source)
-                }  # fmt: skip
             record["squared error over variance"] = _ratio(found, own, scored)
             off = np.degrees(np.median(angle(own[scored, :, 0].swapaxes(-1, -2) @ found.orientations[scored, :, 0]), 0))
             plain = off if method == AIMED else plain
@@ -238,7 +233,7 @@ def _bends(records: list[dict[str, Any]]) -> Table:
     rows = [
         [
             f"{record['noise']}: {record['method']}",
-            *(pair(record["file"]["by bend"][bend]["twist"]) for bend in ("straight", "half", "bent")),
+            *(pair(record["file"]["by bend"][bend]) for bend in ("straight", "half", "bent")),
             *(pair(record["file"]["by speed"][speed]) for speed in ("slow", "middling", "fast")),
         ]
         for record in kept

@@ -204,7 +204,6 @@ def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
         "all": spread(off), "root": spread(off[:, :, 0]), "heading": spread(turned), "tilt": spread(tilt),
         "direction": spread(swing), "twist": spread(twist[:, :, _BALLS]),
         "turn beyond": _excess(found, truth), "root turn beyond": _excess(found[:, :, :1], truth[:, :, :1]),
-        "joints": {JOINTS[joint]: spread(off[:, :, k]) for k, joint in enumerate(SCORED)},
     }  # fmt: skip
     ends = [child_of(joint) for joint in SCORED]
     speed = np.linalg.norm(np.gradient(positions[:, :, ends], 1 / 30, axis=0), axis=-1)
@@ -218,7 +217,7 @@ def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
     }
     bend = _bend(positions)
     result["by bend"] = {
-        name: {"twist": spread(twist[:, :, _BALLS][mask]), "direction": spread(swing[:, :, _BALLS][mask])}
+        name: spread(twist[:, :, _BALLS][mask])
         for name, mask in (
             ("straight", bend < STRAIGHT), ("half", (bend >= STRAIGHT) & (bend < BENT)), ("bent", bend >= BENT)
         )

@@ -17,14 +17,14 @@ import roma
 import torch
 
 from steadypose.benchmarks import product
-from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, Baseline, missing
-from steadypose.benchmarks.bench import Bench, baselines_of, tune, tuning_log
+from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE, missing
+from steadypose.benchmarks.bench import TUNED_ON, Bench, baselines_of, tune_on, tuning_log
 from steadypose.benchmarks.corruption import correlated
 from steadypose.benchmarks.metrics import contact_speed, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.scores import ends_mm, figures, score, source_table
+from steadypose.benchmarks.scores import figures, score, source_table
 from steadypose.benchmarks.studies.root_drift import METHODS, Clip, evaluate_fusion
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
@@ -53,17 +53,12 @@ FRAMES = 192
 def run(bench: Bench) -> Result:
     """Measure the whole pipeline beside filters, then the fusion without a root."""
     clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
-    some = clips.every(3)
-    tuning_observed = correlated(some.positions, NOISE, np.random.default_rng(1))
+    some = clips.every(TUNED_ON)
+    other = correlated(some.positions, NOISE, np.random.default_rng(1))
     seen = correlated(clips.positions, NOISE, np.random.default_rng(0))
     baselines = tuple(baseline for baseline in FILTERS if baseline.delays != (OFFLINE,))
 
-    def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-        answer = baseline.run(tuning_observed, clips.stamps_s, delay, **parameters)
-        found = figures(score(answer, some.positions, missing(tuning_observed), align=False))
-        return {key: found[key] for key in ("position_mm", "acceleration_mm")}
-
-    tuned = tune(bench, evaluate, "world", baselines)
+    tuned = tune_on(bench, other, some.positions, clips.stamps_s, "world", baselines)
     records: list[dict[str, Any]] = [{"method": "truth", "delay": 0, **measure(clips, clips.positions)}]
     errors: dict[str, Floats] = {}
     for baseline, delay in baselines_of(baselines, bench.delays):
@@ -98,7 +93,6 @@ def run(bench: Bench) -> Result:
     )  # fmt: skip
     return Result(
         [
-            _summary(records, hidden),
             sources,
             _table(records, len(clips.offsets)),
             _root_table(by_speed),
@@ -187,11 +181,10 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
 
     For the feet: mean speed in contact (m/s), share of frames that skate, and share with a sole under the floor (%).
     """
-    found = figures(score(answer, clips.positions, missing(clips.positions), align=False), clips.person)
+    found = figures(score(answer, clips.positions, missing(clips.positions)))
     root = position_error(answer[:, :, 0], clips.positions[:, :, 0])
-    result = {key: found[key] for key in ("position_mm", "position_ci_mm", "acceleration_mm")}
+    result = {key: found[key] for key in ("position_mm", "acceleration_mm")}
     result["root_mm"] = round(float(np.nanmean(root)) * 1e3, 2)
-    result["root_ci_mm"] = ends_mm(np.nanmean(root, axis=0), clips.person)
     legs = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
     own = position_error(answer[:, :, legs], clips.positions[:, :, legs])
     result["legs_mm"] = round(float(np.nanmean(own)) * 1e3, 2)
@@ -207,39 +200,6 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
         result[f"{side}_skate_m_s"] = round(float(speed.mean()), 4)
         result[f"{side}_skating_percent"] = round(100 * float((speed > SKATING).mean()), 2)
     return result
-
-
-def _summary(records: list[dict[str, Any]], hidden: Mapping[str, Mapping[str, float]]) -> Table:
-    """Build a table of what ships beside the best filter by position, of at most `DELAY`."""
-    filters = [r for r in records if r["method"] in {baseline.name for baseline in FILTERS} and r["delay"] <= DELAY]
-    best = min(filters, key=lambda r: r["position_mm"])
-    by_method = {r["method"]: r for r in records}
-    rows: list[list[str]] = []
-    for name, r, drift in (
-        ("truth", by_method["truth"], None),
-        (f"best filter: {best['method']}", best, None),
-        ("the same fusion at constant velocity", None, "constant velocity"),
-        ("steadypose: pose/clean", by_method["steadypose: pose/clean"], None),
-        ("steadypose: pose/world", by_method["steadypose: pose/world"], "network and contacts"),
-    ):
-        row = [name, "", "", ""]
-        if r:
-            feet = 0.5 * (r["left_skate_m_s"] + r["right_skate_m_s"])
-            row[1:] = [f"{r['position_mm']:.1f}", f"{r['acceleration_mm']:.2f}", f"{feet:.3f}"]
-        if drift:
-            lost = hidden[drift]
-            row += [f"{lost['hidden 1 s: root cm']:.0f}", f"{lost['hidden 2 s: root cm']:.0f}"]
-            row.append(f"{lost['hidden: m per 10 m walked']:.1f}")
-        rows.append(row + [""] * (7 - len(row)))
-    return Table(
-        name="world-summary",
-        title="In the world, through noise of 2 cm that lasts",
-        columns=["method", "joints, mm", "acceleration error, mm/frame²", "standing feet, m/s",
-                 "trunk hidden 1 s: root, cm", "2 s: root, cm", "m per 10 m walked"],
-        rows=rows,
-        note=f"Delay {DELAY}. Standing feet: mean speed while in contact in truth. Trunk hidden: horizontal error of "
-        "the root; constant velocity: as a filter goes on.",
-    )  # fmt: skip
 
 
 def _table(records: list[dict[str, Any]], clips: int) -> Table:

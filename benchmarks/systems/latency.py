@@ -105,7 +105,7 @@ def live(recording: Path, seconds: float, bench: Bench, title: str) -> dict[str,
     bar = bench.progress.add_task(title, total=seconds)
     bodies: list[int] = []
     most = f"prior.max_bodies={max(LIVE_CROWDS)}"
-    with running(recording, lossless=False, settings=[most]) as (messages, _, _, clock, _):
+    with running(recording, most) as (messages, _, _, clock, _):
         for topic, message in messages:
             now = clock.now_ns()
             if isinstance(message, Diagnostics):

@@ -90,7 +90,7 @@ def restarts(recording: Path, kills: int, progress: Progress) -> dict[str, list[
     """Return the seconds without ``pose/world`` after each kill of each node."""
     found: dict[str, list[float]] = {name: [] for name in POSE_NODES}
     bar = progress.add_task("kills", total=kills * len(POSE_NODES))
-    with running(recording, lossless=False, loop=True) as nodes:
+    with running(recording, "input.loop=true") as nodes:
         _arrivals(nodes, STEADY_S)
         for _ in range(kills):
             for name in POSE_NODES:

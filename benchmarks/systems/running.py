@@ -43,27 +43,10 @@ class Running(NamedTuple):
 
 
 @contextmanager
-def running(
-    recording: Path,
-    *,
-    lossless: bool,
-    rate: float = 1.0,
-    loop: bool = False,
-    record: Path | None = None,
-    settings: Sequence[str] = (),
-) -> Iterator[Running]:
-    """Run the node processes on a recording; with ``record``, also a recorder that writes there."""
-    played = [
-        f"input.recording={json.dumps(str(recording))}",
-        f"input.rate={rate}",
-        f"input.loop={json.dumps(loop)}",
-        f"transport.lossless={json.dumps(lossless)}",
-        *settings,
-    ]
-    if record:  # as on a machine that runs for months: recordings in parts, the oldest of which are deleted
-        limits = {"directory": str(record), "split_mb": 50.0, "keep_mb": 200.0}
-        played += [f"recorder.{name}={json.dumps(value)}" for name, value in limits.items()]
-    with running_nodes([*POSE_NODES, "recorder"] if record else [*POSE_NODES], played) as nodes:
+def running(recording: Path, *settings: str) -> Iterator[Running]:
+    """Run the node processes on a recording at camera rate, with live transport."""
+    played = [f"input.recording={json.dumps(str(recording))}", "input.rate=1.0", "transport.lossless=false"]
+    with running_nodes([*POSE_NODES], [*played, *settings]) as nodes:
         yield nodes
 
 

@@ -8,14 +8,14 @@ from rich.progress import Progress
 
 from steadypose.benchmarks import figures, product
 from steadypose.benchmarks.baselines import smoothnet
-from steadypose.benchmarks.baselines.filters import OFFLINE, Baseline, missing
+from steadypose.benchmarks.baselines.filters import Baseline
 from steadypose.benchmarks.bench import Bench, over_seeds, search
 from steadypose.benchmarks.corruption import gaussian
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.scores import figures as figures_of
 from steadypose.benchmarks.scores import pivot, score
-from steadypose.benchmarks.studies.corrupted import against_best, calibration_table, reliability_bins, run_conditions
+from steadypose.benchmarks.studies.corrupted import calibration_table, reliability_bins, run_conditions
 from steadypose.prior.body.skeleton import J
 
 
@@ -45,22 +45,15 @@ def test_the_clips_that_travel_farthest_are_kept_in_order_as_many_of_each_person
     np.testing.assert_array_equal(chosen.positions, clips.positions[:, best])
 
 
-def test_a_delay_beyond_the_models_window_is_not_available() -> None:
-    assert product.available(product.PRODUCT["steadypose"], 4)
-    assert not product.available(product.PRODUCT["steadypose"], 80)
-
-
 def test_an_undisturbed_answer_scores_zero_and_groups_are_told_apart(clips: MotionClips) -> None:
     hidden = np.zeros(clips.positions.shape[:-1], dtype=bool)
     hidden[:, 0, J["left_wrist"]] = True
     perfect = figures_of(score(clips.positions, clips.positions, hidden))
-    assert perfect["position_mm"] == perfect["acceleration_mm"] == perfect["pa_mm"] == 0.0
+    assert perfect["position_mm"] == perfect["acceleration_mm"] == 0.0
     moved = clips.positions + [0.0, 0.03, 0.0]
     moved[:, 0, J["left_wrist"]] += [0.0, 0.07, 0.0]
     found = figures_of(score(moved, clips.positions, hidden))
     assert (found["seen_mm"], found["hidden_mm"]) == pytest.approx((30.0, 100.0))
-    assert found["limbs_mm"]["legs"] == pytest.approx(30.0)
-    assert found["limbs_mm"]["arms"] > 31.0
 
 
 def test_a_short_training_of_the_temporal_network_already_smooths(clips: MotionClips) -> None:
@@ -80,8 +73,7 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
         bench = Bench(quick=True, mocap=None, data=Path("nowhere.npz"), progress=progress)
         monkeypatch.setitem(bench.__dict__, "smoothnets", [smoothnet.SmoothNet()])
         baselines = (Baseline("raw", lambda seen, _, delay: seen, (0,)),)
-        three = replace(clips, person=np.repeat(["a", "b", "c"], 2))
-        data = run_conditions(bench, three, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, baselines)
+        data = run_conditions(bench, clips, {"4 cm": lambda truth, rng: gaussian(truth, 0.04, rng)}, baselines)
     records = {(r["method"], r["delay"]): r for r in data["records"]}
     assert set(records) == {
         ("raw", 0),
@@ -90,11 +82,7 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
     assert records["raw", 0]["position_mm"] == pytest.approx(40 * np.sqrt(8 / np.pi), rel=0.02)
     record = records["steadypose", 4]
     assert np.mean(record["clips_mm"]["position"]) == pytest.approx(record["position_mm"], abs=1e-3)
-    low, high = record["position_ci_mm"]
-    assert low < record["position_mm"] < high
-    ratio, low, high = records["steadypose", 4]["against_best_baseline"]["position"]["ratio"]
-    assert low < ratio < high
-    assert ratio < 0.95
+    assert record["position_mm"] < 0.95 * records["raw", 0]["position_mm"]
     assert [0.2 < row["seen"]["ratio"] < 4.0 for row in data["calibration"]] == [True, True]
     assert len(reliability_bins(data["calibration"], "steadypose", 4)["4 cm, seen"]) == 10
     assert len(calibration_table(data["calibration"], "calibration").rows) == 2
@@ -103,31 +91,10 @@ def test_conditions_give_records_that_tables_and_pictures_are_made_of(clips: Mot
     assert isinstance(figures.curves(data["records"], "delay", {"position_mm": "mm"}, "frames", "title"), Figure)
 
 
-def test_the_best_peer_is_another_for_each_error(clips: MotionClips) -> None:
-    from steadypose.benchmarks.bench import Answer
-
-    hidden = missing(clips.positions)
-    answers = {
-        name: Answer(name, delay, clips.stamps_s, clips.positions + move, {})
-        for name, delay, move in (
-            ("still", 0, 0.03 + np.random.default_rng(1).normal(0, 1e-4, clips.positions.shape)),
-            ("shaking", 0, np.random.default_rng(0).normal(0, 0.01, clips.positions.shape)),
-            ("late", 8, np.array([0.001, 0.0, 0.0])),
-            ("all", OFFLINE, np.zeros(3)),
-        )
-    }
-    mine = Answer("steadypose", 4, clips.stamps_s, clips.positions + [0.02, 0.0, 0.0], {})
-    scored = [(a, score(a.positions, clips.positions, hidden)) for a in (*answers.values(), mine)]
-    found = against_best(mine, scored[-1][1], scored, clips.person)
-    assert found["position"]["baseline"] == "shaking, delay 0"
-    assert found["acceleration_error"]["baseline"] == "still, delay 0"
-
-
-def test_seeds_are_averaged_and_their_spread_kept() -> None:
+def test_seeds_are_averaged() -> None:
     one = {"method": "a", "delay": 0, "condition": "x", "position_mm": 10.0, "hidden_mm": 4.0}
     (merged,) = over_seeds([one, {**one, "position_mm": 12.0}])
     assert merged["position_mm"] == 11.0
-    assert merged["position_sd_over_seeds_mm"] == pytest.approx(1.414, abs=1e-3)
     assert merged["seeds"] == 2
 
 

@@ -5,10 +5,7 @@ from scipy.spatial.transform import Rotation
 from steadypose.benchmarks.metrics import (
     acceleration_error,
     body_frame,
-    bootstrap,
-    bootstrap_ratio,
     contact_speed,
-    found_delay,
     length_variation,
     position_error,
     procrustes,
@@ -81,14 +78,6 @@ def test_body_frame_turns_with_the_body() -> None:
     np.testing.assert_allclose(upright.T @ upright, np.eye(3), atol=1e-12)
 
 
-def test_bootstrap_covers_the_mean_as_the_normal_interval_does() -> None:
-    values = np.random.default_rng(5).normal(3.0, 1.0, 400)
-    half = 1.96 * values.std() / 20
-    assert bootstrap(values) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.02)
-    baseline = np.random.default_rng(6).uniform(1.0, 10.0, 100)
-    assert bootstrap_ratio(0.8 * baseline, baseline) == pytest.approx((0.8, 0.8, 0.8)), "a pair's ratio is sure"
-
-
 def test_procrustes_undoes_turn_size_and_place_of_every_frame_but_no_mirror() -> None:
     truth = walk(3)
     turns = Rotation.random(len(truth), rng=np.random.default_rng(1)).as_matrix()
@@ -97,19 +86,6 @@ def test_procrustes_undoes_turn_size_and_place_of_every_frame_but_no_mirror() ->
     np.testing.assert_allclose(procrustes(seen, truth), np.where(np.isnan(seen), np.nan, truth), atol=1e-9)
     mirrored = truth * [1.0, 1.0, -1.0]
     assert position_error(procrustes(mirrored, truth), truth).mean() > 0.01
-
-
-@pytest.mark.parametrize("lag", [-1.0, 0.0, 0.4, 3.0])
-def test_a_delay_is_found_between_frames(lag: float) -> None:
-    rng = np.random.default_rng(0)
-    rates, phases = rng.uniform(0.05, 0.4, (2, 8, 3)) * [[[1.0]], [[20.0]]]
-
-    def pose(times: np.ndarray) -> np.ndarray:
-        return np.sin(rates * times[:, None, None] + phases)
-
-    times = np.arange(90.0)
-    noise = rng.normal(0, 0.02, (90, 8, 3))
-    assert found_delay(pose(times - lag) + noise, pose(times), most=8) == pytest.approx(lag, abs=0.1)
 
 
 def test_stated_and_found_deviations() -> None:
