@@ -204,6 +204,7 @@ def score(found: Floats, truth: Floats, positions: Floats) -> dict[str, Any]:
         "all": spread(off), "root": spread(off[:, :, 0]), "heading": spread(turned), "tilt": spread(tilt),
         "direction": spread(swing), "twist": spread(twist[:, :, _BALLS]),
         "turn beyond": _excess(found, truth), "root turn beyond": _excess(found[:, :, :1], truth[:, :, :1]),
+        "joints": {JOINTS[joint]: spread(off[:, :, k]) for k, joint in enumerate(SCORED)},
     }  # fmt: skip
     ends = [child_of(joint) for joint in SCORED]
     speed = np.linalg.norm(np.gradient(positions[:, :, ends], 1 / 30, axis=0), axis=-1)
