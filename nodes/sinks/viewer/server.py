@@ -15,6 +15,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
+from http.client import InvalidURL
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -101,17 +103,18 @@ class PageServer:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                if called(self.headers.get("Host"), names) is None:
-                    self.send_error(403, "expected this machine's own name or address")
-                    return
-                try:
-                    path = urlsplit(self.path).path  # the query is for the page in the browser
-                    if path.endswith(DRAWINGS):
-                        self._send_drawings(path)
-                    else:
-                        self._send_page(path)
-                except (BrokenPipeError, ConnectionResetError):
-                    pass  # the browser disconnected
+                with suppress(BrokenPipeError, ConnectionResetError):  # the browser disconnected
+                    if called(self.headers.get("Host"), names) is None:
+                        self.send_error(403, "expected this machine's own name or address")
+                        return
+                    try:
+                        path = urlsplit(self.path).path  # the query is for the page in the browser
+                        if path.endswith(DRAWINGS):
+                            self._send_drawings(path)
+                        else:
+                            self._send_page(path)
+                    except (ValueError, InvalidURL):
+                        self.send_error(400, "expected a path of the page")
 
             def _send_drawings(self, path: str) -> None:
                 if not is_token(path, own_path):

@@ -31,7 +31,7 @@ from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
 from steadypose.nodes.sinks.viewer.node import ViewerNode
 from steadypose.nodes.sinks.viewer.scene import PoseView
-from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, ViewerError, ViewerServer
+from steadypose.nodes.sinks.viewer.server import LOOPBACK, Drawings, PageServer, ViewerError, ViewerServer
 from steadypose.nodes.sources.image import CameraImage
 
 rr = pytest.importorskip("rerun", reason="the optional extra `view` is not installed")
@@ -371,3 +371,16 @@ def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(vie
     assert log.blueprints > layouts, "a panel of its own"
     view.log(POSE_CLEAN, cleaned[2])
     assert len(log.times("camera/image")) == 2
+
+
+@pytest.mark.parametrize("path", ["http://[", ":x", "/\x01", "/\xe9"])
+def test_a_request_that_is_none_is_answered_as_such(path: str, capfd: pytest.CaptureFixture[str]) -> None:
+    port = free_port()
+    page = PageServer(LOOPBACK, port, "http://127.0.0.1:1", "token", Drawings())
+    try:
+        with socket.create_connection((LOOPBACK, port), 20) as it:
+            it.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode("latin-1"))
+            assert it.recv(100).startswith(b"HTTP/1.0 400")
+    finally:
+        page.close()
+    assert "Traceback" not in capfd.readouterr().err
