@@ -1,9 +1,10 @@
+import json
 import socket
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from conftest import repeated, running, until
-from tests.helpers.foxglove_client import first_message
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.topics import POSE_WORLD
@@ -46,3 +47,20 @@ def test_who_subscribes_late_gets_what_is_latched() -> None:
 def test_a_port_that_is_taken_is_said_with_what_to_do() -> None:
     with socket.create_server((HOST, 0)) as other, pytest.raises(LaunchError, match=r"set another \[foxglove\] port"):
         FoxgloveOutput(other.getsockname()[1])
+
+
+def first_message(port: int, topic: str) -> tuple[dict[str, Any], bytes]:
+    """What a server says of a topic's channel, and the first message on it."""
+    client = pytest.importorskip("websockets.sync.client", reason="the extra 'web' is not installed")
+    with client.connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
+        offered: dict[str, dict[str, Any]] = {}
+        while topic not in offered:
+            told = json.loads(connection.recv(20))
+            offered |= {channel["topic"]: channel for channel in told.get("channels", ())}
+        asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": offered[topic]["id"]}]}
+        connection.send(json.dumps(asked))
+        while not isinstance(said := connection.recv(20), bytes) or said[0] != 1:
+            # the SDK offers a channel a moment before it knows it, and refuses who subscribes in between
+            if isinstance(said, str) and "unknown channel" in said.lower():
+                connection.send(json.dumps(asked))
+        return offered[topic], said[13:]  # after four bytes of subscription and eight of time

@@ -1,4 +1,4 @@
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +9,6 @@ from conftest import VirtualClock, another_python, raw, running, until, walking
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.helpers.given import Given
 from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.codec import MAX_BODIES
@@ -25,6 +24,7 @@ from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.ros2 import CACHE_NS, TfSettings, TfSource, TransformBuffer, TransformError
+from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
@@ -238,3 +238,19 @@ def test_a_recording_is_not_asked_of_tf(tmp_path: Any) -> None:
     settings = InputSettings(recording=str(tmp_path / "x.npz"), tf=TfSettings(fixed_frame="odom"))
     with pytest.raises(LaunchError, match="for live sources"):
         open_input(settings, VirtualClock())
+
+
+class Given(LiveSource):
+    """Gives these frames, then none."""
+
+    def __init__(self, *frames: PoseRaw | None) -> None:
+        super().__init__()
+        self._frames = frames
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        yield from self._frames
+        while True:
+            yield None
+
+    def status(self) -> dict[str, str]:
+        return {}
