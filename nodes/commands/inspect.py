@@ -21,7 +21,6 @@ import tyro
 from numpy.typing import NDArray
 
 from steadypose.msgs.recording import RecordingReader
-from steadypose.msgs.security import load_keys
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
@@ -80,9 +79,8 @@ def endpoints_of(topic: str, launch: str | None, endpoints: tuple[str, ...]) -> 
 
 def subscribe(topic: str, launch: str | None, endpoints: tuple[str, ...], *, conflate: bool = False) -> Subscriber:
     transport = _transport(launch)
-    keys = load_keys(transport.keys) if transport.keys else None
     addresses = endpoints_of(topic, launch, endpoints)
-    return Subscriber(addresses, topic, keys=keys, clear_text=transport.clear_text, conflate=conflate)
+    return Subscriber(addresses, topic, keys=transport.curve_keys(), clear_text=transport.clear_text, conflate=conflate)
 
 
 def receive(subscriber: Subscriber, topic: str) -> Iterator[tuple[str, Message]]:

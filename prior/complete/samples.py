@@ -15,8 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, solve_rotations
-from steadypose.prior.complete.body import Completed
-from steadypose.prior.complete.windows import frames_apart
+from steadypose.prior.complete.body import Completed, frames_apart
 from steadypose.prior.models.posture import trunk_frame
 
 SMOOTH = 30.0

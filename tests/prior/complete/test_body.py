@@ -7,10 +7,9 @@ from tests.helpers.bodies import waving
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.complete import body, parts
-from steadypose.prior.complete.body import Uncertainty, complete
+from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
 from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.complete.stream import bridge, is_root_centred, root_path
-from steadypose.prior.complete.windows import LONGEST, LONGEST_GAP, frames_apart, gaps, views
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.models.root_velocity import NewestMotion
