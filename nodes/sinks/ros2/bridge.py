@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from steadypose import PACKAGE
 from steadypose.msgs.types import Message, PoseWorld
 from steadypose.nodes.checks.problem import Problem, warning
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.ros2 import check_ros, connect
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 RVIZ, LAYOUT = PACKAGE / "launch/views/steadypose.rviz", PACKAGE / "launch/views/foxglove.json"
 GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
 """Topics outside any namespace, by ROS's convention."""
+SILENT_NS = 5_000_000_000
+"""Time without a message after which the bodies of a source are removed, nanoseconds."""
 
 
 def check_ros2(launch: Launch) -> None:
@@ -128,7 +131,17 @@ class RosMessagesNode(Node):
 
     _topics: BodyTopics
 
+    def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
+        super().__init__(launch, clock)
+        self._heard_ns: dict[str, int] = {}
+
     def handle(self, topic: str, message: Message) -> None:
+        now_ns = self.clock.monotonic_ns()
+        if isinstance(message, PoseWorld):
+            self._heard_ns[message.source] = now_ns
+        for source in [source for source, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]:
+            del self._heard_ns[source]
+            self._topics.forget(source)
         if refused := self._topics.send(message):
             self.health.counts["refused.body not finite"] += refused
 
@@ -147,7 +160,11 @@ class Ros2BridgeNode(RosMessagesNode):
         connection = connect("steadypose_bridge", self._settings.namespace)
         try:
             self._output = RosOutput(connection, self._settings.namespace)
-            self._topics = BodyTopics(self._output, self._settings)  # pyright: ignore[reportArgumentType]  (one class, found under two names)
+            self._topics = BodyTopics(
+                self._output,
+                self._settings,  # pyright: ignore[reportArgumentType]  (one class, found under two names)
+                several=bool(self.launch.server.clients),
+            )
             print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
             super().work()
         finally:
@@ -181,7 +198,11 @@ class FoxgloveNode(RosMessagesNode):
         output = FoxgloveOutput(settings.port)
         try:
             self.url = output.url
-            self._topics = BodyTopics(output, Ros2BridgeSettings(world_frame=settings.world_frame))  # pyright: ignore[reportArgumentType]
+            self._topics = BodyTopics(
+                output,
+                Ros2BridgeSettings(world_frame=settings.world_frame),  # pyright: ignore[reportArgumentType]
+                several=bool(self.launch.server.clients),
+            )
             print(f"Foxglove: {self.url}, layout {LAYOUT.resolve()}", flush=True)
             super().work()
         finally:

@@ -189,10 +189,11 @@ def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
     ]  # fmt: skip
 
 
-def names_of(world: PoseWorld) -> tuple[dict[str, WorldBody], int]:
-    """A message's publishable bodies by ROS name, and the number of tracked bodies that are not finite."""
+def names_of(world: PoseWorld, source: str) -> tuple[dict[str, WorldBody], int]:
+    """A message's publishable bodies by ROS name, and the number of tracked bodies that are not finite. ``source`` is
+    a part of the names, unless empty."""
     followed = [body for body in world.bodies if body.tracking != Tracking.LOST]
-    found = {body_name(body.id): body for body in followed if is_finite(body)}
+    found = {body_name(body.id, source): body for body in followed if is_finite(body)}
     return found, len(followed) - len(found)
 
 
@@ -213,11 +214,18 @@ class Output(Protocol):
 
 
 class BodyTopics:
-    """Sends steadypose's messages to ROS topics."""
+    """Sends steadypose's messages to ROS topics.
 
-    def __init__(self, output: Output, settings: Ros2BridgeSettings) -> None:
-        self._output, self._settings = output, settings
+    Args:
+        output: the receiver of the topics.
+        settings: frames and what is published.
+        several: whether there are several sources, each with ids of its own: names of bodies then contain the source.
+    """
+
+    def __init__(self, output: Output, settings: Ros2BridgeSettings, *, several: bool = False) -> None:
+        self._output, self._settings, self._several = output, settings, several
         self._root_covariance = RootCovariance()
+        self._names: dict[str, list[str]] = {}  # of the bodies of each source's newest message
         self._measured: dict[str, dict[str, np.ndarray]] = {}
         self._still: dict[str, Pose] = {}
         self._moving: set[str] = set()
@@ -239,14 +247,23 @@ class BodyTopics:
         """Publish the time of a replay."""
         self._send("clock", new("rosgraph_msgs/msg/Clock", clock=header(max(stamp_ns, 0), "").stamp))
 
-    def _send_world(self, world: PoseWorld) -> int:
-        where = header(world.stamp_ns, world.frame_id)
-        bodies, refused = names_of(world)
-        for gone in self._measured.keys() - bodies.keys():
-            del self._measured[gone]
+    def forget(self, source: str) -> None:
+        """Remove the bodies of a source, which has fallen silent."""
+        self._drop(self._names.pop(source, ()))
+
+    def _drop(self, names: Iterable[str]) -> None:
+        for gone in names:
+            self._measured.pop(gone, None)
             for topic in OF_BODY:
                 self._output.drop(f"{BODIES}/{gone}/{topic}")
-        self._send(f"{BODIES}/tracked", new("hri_msgs/msg/IdsList", header=where, ids=list(bodies)))
+
+    def _send_world(self, world: PoseWorld) -> int:
+        where = header(world.stamp_ns, world.frame_id)
+        bodies, refused = names_of(world, world.source if self._several else "")
+        self._drop(set(self._names.get(world.source, ())) - bodies.keys())
+        self._names[world.source] = list(bodies)
+        tracked = [name for names in self._names.values() for name in names]
+        self._send(f"{BODIES}/tracked", new("hri_msgs/msg/IdsList", header=where, ids=tracked))
         self._send(MARKERS, marker_array(world, bodies))
         self._send(POSES, pose_array(world, bodies))
         transforms: list[Any] = []

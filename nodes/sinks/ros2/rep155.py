@@ -11,6 +11,7 @@ are fixed in torso and body.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -69,9 +70,12 @@ JOINTS: tuple[str, ...] = (
 """Names of the moving joints, without the body's id."""
 
 
-def body_name(body_id: int) -> str:
-    """A body's id for ROS's names of topics and frames, whose parts must not begin with a digit."""
-    return f"b{body_id & 0xFFFFFFFF:x}"
+def body_name(body_id: int, source: str = "") -> str:
+    """A body's id for ROS's names of topics and frames, whose parts must not begin with a digit; with its source, if
+    ids are unique only among those of one source."""
+    # ROS allows ASCII letters, digits and single underscores
+    plain = re.sub("[^0-9A-Za-z]+", "_", source.encode("ascii", "backslashreplace").decode()).strip("_")
+    return f"b{body_id & 0xFFFFFFFF:x}" + (f"_{plain}" if plain else "")
 
 
 def joint_rotations(body: WorldBody) -> Floats:

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from conftest import another_python, running, until
+from conftest import VirtualClock, another_python, running, until
 from scipy.spatial.transform import Rotation
 from tests.helpers.ros_output import Kept
 from tests.helpers.synthetic_poses import messages
@@ -27,8 +27,8 @@ from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import Connection, deserialise, new, serialise, stamp_ns
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
-from steadypose.nodes.sinks.ros2.messages import BodyTopics
+from steadypose.nodes.sinks.ros2.bridge import SILENT_NS, Ros2BridgeNode, Ros2BridgeSettings, RosOutput, check_ros2
+from steadypose.nodes.sinks.ros2.messages import OF_BODY, BodyTopics
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, LINKS, frames
 from steadypose.nodes.sources.ros2 import TransformBuffer
 
@@ -227,6 +227,29 @@ def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(stream: S
     assert set(kept.dropped) == {f"humans/bodies/b1/{topic}" for topic in ("joint_states", "odom", "urdf")}
     assert topics.send(dataclasses.replace(world, bodies=[nowhere])) == 1
     assert kept.of("humans/bodies/tracked")[-1].ids == []
+
+
+def test_sources_have_bodies_of_their_own_until_they_fall_silent(
+    make_launch: Callable[..., Launch], clock: VirtualClock, stream: Stream
+) -> None:
+    """Of a server's clients, each numbers its bodies from 0."""
+    kept, node = Kept(), Ros2BridgeNode(make_launch(nodes='["trajectory", "ros2_bridge"]'), clock)
+    node._settings = Ros2BridgeSettings()
+    node._topics = BodyTopics(kept, node._settings, several=True)
+    here, there = (dataclasses.replace(stream[1][-1], source=source) for source in ("hall", "front door"))
+    for world in (here, there, here, there):
+        node.handle(POSE_WORLD, world)
+    assert not kept.dropped
+    ids = {"b0_hall", "b1_hall", "b0_front_door", "b1_front_door"}
+    assert {*kept.of("humans/bodies/tracked")[-1].ids} == ids
+    assert all(len(kept.of(f"humans/bodies/{name}/odom")) == 2 for name in ids)
+    assert all(len(kept.of(f"humans/bodies/{name}/urdf")) == 1 for name in ids)
+    for _ in range(11):
+        clock.time_ns += SILENT_NS // 10
+        node.handle(POSE_WORLD, here)
+    gone = {f"humans/bodies/{body}_front_door/{topic}" for body in ("b0", "b1") for topic in OF_BODY}
+    assert (set(kept.dropped), len(kept.dropped)) == (gone, len(gone))
+    assert kept.of("humans/bodies/tracked")[-1].ids == ["b0_hall", "b1_hall"]
 
 
 def test_a_type_that_is_not_to_be_had_is_told_and_the_rest_goes_on() -> None:
