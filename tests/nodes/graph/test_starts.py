@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 from conftest import record, running, until, walk
-from numba.core.dispatcher import Dispatcher
 from runs import INPUT_ALONE, Run, runs
+from tests.prior.clean.test_pipeline import loops
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
@@ -286,19 +286,12 @@ print("works")
     assert run.stdout == "starts\nstarts\nworks\n"
 
 
-def kinds() -> dict[str, int]:
-    """Of every compiled function of the prior, for how many kinds of arguments it is loaded."""
-    found = [value for name, module in list(sys.modules.items()) if name.startswith("steadypose.prior.")
-             for value in vars(module).values() if isinstance(value, Dispatcher)]  # fmt: skip
-    return {f"{f.py_func.__module__}.{f.py_func.__qualname__}": len(f.signatures) for f in found}
-
-
 def test_the_second_process_compiles_nothing_that_the_first_would_not() -> None:
     assert trajectory_node.TrajectoryNode.name == "trajectory"  # its loops are loaded with it
     compile_from_the_beginning()
-    loaded = kinds()
+    loaded = loops()
     compile_from_the_end()
-    assert {name: number for name, number in kinds().items() if number != loaded.get(name)} == {}
+    assert {name: number for name, number in loops().items() if number != loaded.get(name)} == {}
 
 
 def test_one_that_compiles_for_ever_is_not_waited_for(tmp_path: Path) -> None:
