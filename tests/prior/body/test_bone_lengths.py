@@ -2,9 +2,18 @@ import numpy as np
 import pytest
 from tests.helpers.bodies import fk, random_pose, waving
 
-from steadypose.prior.body.bone_lengths import estimate_bones, estimate_offsets
+from steadypose.prior.body.bone_lengths import (
+    LENGTH_BIASES,
+    LIKE_SAMPLES,
+    LIMB_SPREAD,
+    STATURE_SPREAD,
+    TRUNK_PLACE_SPREAD,
+    TRUNK_SPREAD,
+    estimate_bones,
+    estimate_offsets,
+)
 from steadypose.prior.body.inverse_kinematics import solve_pose
-from steadypose.prior.body.skeleton import MIRROR, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import HIPS, LIMB_ENDS, MIRROR, PARENTS, REST_OFFSETS, J
 
 BIAS, NOISE = 0.02, 0.01
 LEFT_HIP, RIGHT_KNEE = J["left_hip"], J["right_knee"]
@@ -73,6 +82,48 @@ def test_what_is_still_to_be_learned_of_a_bone_falls_with_every_sample_and_ends(
     assert (variance[-1] == 0).all()
     sure = estimate_bones(positions[:1], 0.0, 0.001, 64).length_variance
     assert sure.max() < 0.002**2
+
+
+def test_lengths_are_the_posterior_of_a_stature_and_each_bones_own() -> None:
+    """Against the joint Gaussian of all logarithms of lengths, conditioned at once."""
+    frames, samples = 5, 20
+    rng = np.random.default_rng(2)
+    ratio = np.exp(0.1 * rng.standard_normal(22))
+    ratio = np.minimum(ratio, ratio[MIRROR])  # equal on both sides
+    person = REST_OFFSETS * ratio[:, None]
+    positions = np.zeros((frames, 22, 3))
+    for joint in range(1, 22):
+        positions[:, joint] = positions[:, PARENTS[joint]] + person[joint]
+    bones = [joint for joint in range(1, 22) if joint <= MIRROR[joint]]
+    rest = lengths(REST_OFFSETS)[bones]
+    sides = np.array([1 if MIRROR[joint] == joint else 2 for joint in bones])
+    spread = np.array([LIMB_SPREAD if joint in LIMB_ENDS else TRUNK_SPREAD for joint in bones])
+    prior = np.diag(spread**2) + STATURE_SPREAD**2
+    bias, noise = LENGTH_BIASES * BIAS, np.sqrt(2.0) * NOISE
+
+    def posterior(count: int) -> tuple[np.ndarray, np.ndarray]:
+        error = (bias**2 / (1 + count / LIKE_SAMPLES) + noise**2 / (sides * count)) / rest**2
+        gain = prior @ np.linalg.inv(prior + np.diag(error))
+        return gain @ np.log(ratio[bones]), np.diag(prior - gain @ prior)
+
+    (mean, now), (_, then) = posterior(frames), posterior(samples)
+    found = estimate_bones(positions, BIAS, NOISE, samples)
+    of_limbs = [k for k, joint in enumerate(bones) if joint in LIMB_ENDS]
+    expected = rest * np.exp(mean)
+    np.testing.assert_allclose(lengths(found.offsets)[bones][of_limbs], expected[of_limbs], rtol=1e-9)
+    to_learn = (now - then) * expected**2
+    np.testing.assert_allclose(found.length_variance[bones][of_limbs], to_learn[of_limbs], rtol=1e-9)
+
+    # the hips are placed on the pelvis, each axis by itself
+    def weight(count: int) -> float:
+        doubt = bias**2 / (1 + count / LIKE_SAMPLES) + noise**2 / count
+        return TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + doubt)
+
+    scaled = REST_OFFSETS[HIPS[0]] * np.exp(mean[bones.index(HIPS[0])])
+    placed = scaled + weight(frames) * (person[HIPS[0]] - scaled)
+    np.testing.assert_allclose(found.offsets[HIPS[0]], placed, atol=5e-4)
+    expected_variance = TRUNK_PLACE_SPREAD**2 * (weight(samples) - weight(frames))
+    assert found.length_variance[HIPS[0]] == pytest.approx(expected_variance)
 
 
 def test_bones_are_recovered_from_noisy_poses() -> None:
