@@ -13,7 +13,7 @@ from steadypose.prior.body.bone_lengths import (
     estimate_offsets,
 )
 from steadypose.prior.body.inverse_kinematics import solve_pose
-from steadypose.prior.body.skeleton import HIPS, LIMB_ENDS, MIRROR, PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import COLLARS, HIPS, LIMB_ENDS, MIRROR, PARENTS, REST_OFFSETS, J
 
 BIAS, NOISE = 0.02, 0.01
 LEFT_HIP, RIGHT_KNEE = J["left_hip"], J["right_knee"]
@@ -73,6 +73,15 @@ def test_a_joint_never_seen_lies_between_its_neighbours() -> None:
     hidden = [J[n] for n in ("spine1", "spine2", "left_collar", "right_collar")]
     positions[:, hidden] = np.nan
     assert worst(estimate_bones(positions, BIAS, NOISE, 64).offsets, 1.1 * REST_OFFSETS) < 0.02
+
+
+def test_a_collar_never_seen_is_where_the_shoulder_says() -> None:
+    person = REST_OFFSETS.copy()
+    person[[*COLLARS]] += [0.04, 0.0, 0.02]
+    positions = fk(random_pose(np.random.default_rng(4), 64, spread=0.2), person)
+    positions[:, [*COLLARS]] = np.nan
+    found = estimate_bones(positions, 0.0, 0.001, 64).offsets
+    np.testing.assert_allclose((found - REST_OFFSETS)[[*COLLARS]], [[0.04, 0.0, 0.02]] * 2, atol=0.015)
 
 
 def test_what_is_still_to_be_learned_of_a_bone_falls_with_every_sample_and_ends() -> None:
