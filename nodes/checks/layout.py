@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import PoseRaw
-from steadypose.nodes.checks.problem import Problem, bodies, error, some_bodies, warning
+from steadypose.msgs.types import Level, PoseRaw, RawBody
+from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.clean.settings import PriorSettings
@@ -27,6 +29,11 @@ _LAYOUT_OF = {
 """Names by which others know a layout, in small letters and without separators."""
 ENOUGH = 5
 """Smallest number of messages to judge by."""
+HANDOVERS = 3
+"""Smallest number of handovers from one id to another in a window that make a problem: a tracker that loses a person
+now and then has fewer."""
+SAME_PLACE = 0.15
+"""Largest distance between two bodies in one place, relative to their size."""
 
 
 def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterator[Problem]:
@@ -176,12 +183,37 @@ def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iter
         return
     appearances = Counter(body.id for body in bodies(messages))
     inhabited = sum(bool(raw.bodies) for raw in messages)
-    if inhabited >= 2 * ENOUGH and np.median(list(appearances.values())) <= 2 and len(appearances) > 2 * most:
-        yield error(
+    always = inhabited >= 2 * ENOUGH and np.median(list(appearances.values())) <= 2 and len(appearances) > 2 * most
+    if always or _handovers(messages) >= HANDOVERS:
+        problem = error(
             "ids_change",
             f"{len(appearances)} ids in {inhabited} messages of at most {most} bodies: expected a person to keep the "
             "id; where the tracker does not, --set prior.identify.enabled=true",
         )
+        yield problem if always else replace(problem, level=Level.WARN)
+
+
+def _handovers(messages: Sequence[PoseRaw]) -> int:
+    """Number of messages in which a new id is where another id was in the message before, and no longer is. People who
+    walk in and out do not take each other's places from one message to the next.
+    """
+    found = 0
+    for before, after in pairwise(messages):
+        left, came = {body.id: body for body in before.bodies}, {body.id: body for body in after.bodies}
+        found += any(
+            _is_same_place(left[gone], came[new])
+            for gone in left.keys() - came.keys()
+            for new in came.keys() - left.keys()
+        )
+    return found
+
+
+def _is_same_place(one: RawBody, other: RawBody) -> bool:
+    a, b = observed(one), observed(other)
+    if a.shape != b.shape:
+        return False
+    size = np.nanmax(np.nanmax(a, axis=0) - np.nanmin(a, axis=0))
+    return bool(np.nanmedian(np.linalg.norm(a - b, axis=1)) < SAME_PLACE * size)
 
 
 def count_hint(shape: Sequence[int]) -> str:

@@ -114,6 +114,7 @@ AT_PELVIS_OR_NOWHERE = body(
     lambda it, k: RawBody(it.id, it.positions[:1] + np.full((22, 1), np.nan if k % 3 == 0 else 0.0), it.confidence)
 )
 ID_A_FRAME = body(lambda it, index: moved(it, 0.0, index))
+ID_FOR_FIVE = body(lambda it, index: moved(it, 0.0, index // 5))
 ONE_ID_IN_TURN = body(lambda it, index: moved(it, 1.5 * (index % 2)))
 
 MISUSES: dict[str, tuple[Spoil, str, str]] = {
@@ -181,6 +182,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "confidences to 255": (confidence(lambda it: it * 255), "confidence_range", "divide by 255"),
     "confidences below zero": (confidence(lambda it: it - 2), "confidence_range", "below 0 counts as 0"),
     "confidences of NaN": (confidence(lambda it: it * np.nan), "confidence_nan", "1 where the source has no"),
+    "an id for five frames": (ID_FOR_FIVE, "ids_change", "prior.identify.enabled=true"),
     "an id a frame": (ID_A_FRAME, "ids_change", "prior.identify.enabled=true"),
     "all ids the same": (bodies(lambda it: [it, moved(it, 1.0)]), "ids_repeated", "number them"),
     "eleven bodies": (bodies(lambda it: [moved(it, k, k) for k in range(11)]), "too_many_bodies", "max_bodies=11"),
@@ -240,6 +242,12 @@ def test_where_the_confidence_is_zero_a_position_means_nothing() -> None:
 def test_a_good_stream_has_no_problem(skeleton: str) -> None:
     good = walk(layout=skeleton)
     assert not told(good)
+
+
+def test_who_walks_in_and_out_has_another_id_of_good_right() -> None:
+    """Every half second somebody comes in half a metre from where somebody leaves."""
+    come = body(lambda it, index: moved(it, 0.3 * (index // 15 % 2), index // 15))
+    assert not told([come(raw, index) for index, raw in enumerate(walk())])
 
 
 @pytest.mark.parametrize("name", STREAMS)
