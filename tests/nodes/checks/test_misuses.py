@@ -245,8 +245,8 @@ def test_a_good_stream_has_no_problem(skeleton: str) -> None:
 
 
 def test_who_walks_in_and_out_has_another_id_of_good_right() -> None:
-    """Every half second somebody comes in half a metre from where somebody leaves."""
-    come = body(lambda it, index: moved(it, 0.3 * (index // 15 % 2), index // 15))
+    """Three times a second somebody comes in half a metre from where somebody leaves."""
+    come = body(lambda it, index: moved(it, 0.3 * (index // 10 % 2), index // 10))
     assert not told([come(raw, index) for index, raw in enumerate(walk())])
 
 
