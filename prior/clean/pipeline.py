@@ -96,6 +96,8 @@ class BodyPipeline(ABC, Generic[Key]):
         keyed = list(zip(keys, bodies.values(), strict=True))
         if (out := self._slots.crowded_out(self.most_bodies, keyed, sensor.origin)).any():
             self._drop(out)
+        if (out := self._slots.making_way(keyed)).any():
+            self._drop(out)
         joints = self._slots.arrange(keyed)
         self._layout_sigma[np.isfinite(joints.positions).any(axis=(1, 2))] = layout.sigma
         return joints

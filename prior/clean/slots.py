@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -14,6 +14,9 @@ from steadypose.prior.clean.adapt import BodyJoints
 
 MIN_JOINTS = 6
 """Least number of observed canonical joints of a new body."""
+ABSENT_NS = 200_000_000
+"""Time without an observation after which a body makes way for a new one if no slot is free, nanoseconds. A detector
+misses people for less, and a client's frame may come that late."""
 
 
 Key = TypeVar("Key", bound=Hashable)
@@ -40,6 +43,7 @@ class Slots(Generic[Key]):
         self.left_out = 0
         self._distance = np.full(count, np.inf)
         self.present = np.zeros(count, dtype=bool)
+        self._now_ns = 0  # on the grid
         self._last_observed_ns = np.zeros(count, dtype=np.int64)  # 0: not on the grid yet
 
     def crowded_out(self, most: int, bodies: Iterable[tuple[Key | None, BodyJoints]], sensor: Floats) -> Bools:
@@ -54,6 +58,18 @@ class Slots(Generic[Key]):
                     self._distance[self.keys.index(key)] = _distance(joints.positions, sensor)
             taken = [slot for slot, key in enumerate(self.keys) if key is not None]
             out[sorted(taken, key=self._distance.__getitem__)[most:]] = True
+        return out
+
+    def making_way(self, bodies: Sequence[tuple[Key | None, BodyJoints]]) -> Bools:
+        """Return the slots (S,) of absent bodies that new ones need, those that are absent the longest."""
+        out = np.zeros(len(self.keys), dtype=bool)
+        new = [key for key, joints in bodies if key not in (None, *self.keys) and _observed(joints) >= MIN_JOINTS]
+        if lacking := max(len(new) - self.keys.count(None), 0):
+            absent_ns = np.where(self._last_observed_ns > 0, self._now_ns - self._last_observed_ns, 0)
+            keys = {key for key, _ in bodies}
+            here = np.array([key in keys for key in self.keys])
+            longest = np.argsort(np.where(here, 0, -absent_ns), kind="stable")[:lacking]
+            out[longest] = ~here[longest] & (absent_ns[longest] > ABSENT_NS)
         return out
 
     @property
@@ -72,13 +88,14 @@ class Slots(Generic[Key]):
         for key, joints in bodies:
             if key is None:
                 continue
-            slot = self._slot(key, int(np.isfinite(joints.positions[:, 0]).sum()))
+            slot = self._slot(key, _observed(joints))
             if slot is not None:
                 positions[slot], confidence[slot] = joints
         return BodyJoints(positions, confidence)
 
     def advance(self, stamp_ns: int, positions: Floats) -> Bools:
         """Advance to a grid time with its joints (S, 22, 3); return the slots (S,) whose bodies have timed out."""
+        self._now_ns = stamp_ns
         taken = np.array([key is not None for key in self.keys])
         observed = np.asarray(finite_joints(positions).any(axis=1))
         self.present = self.present & taken | observed
@@ -111,6 +128,11 @@ class Slots(Generic[Key]):
         self._last_observed_ns[slot] = 0
         self._distance[slot] = np.inf
         return slot
+
+
+def _observed(joints: BodyJoints) -> int:
+    """Return the number of a body's observed joints."""
+    return int(np.isfinite(joints.positions[:, 0]).sum())
 
 
 def _distance(positions: Floats, sensor: Floats) -> float:

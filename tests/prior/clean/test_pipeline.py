@@ -222,6 +222,24 @@ def test_a_body_that_leaves_is_dropped_and_its_place_is_free() -> None:
     assert np.allclose(next(b for b in first.bodies if b.id == 3).positions, p[30] + [1, 1, 0], atol=0.05)
 
 
+@pytest.mark.parametrize(("gap", "refused"), [(1, 6), (6, 1), (10, 0)])
+def test_who_has_left_makes_way_for_who_is_there(gap: int, refused: int) -> None:
+    """But not at once: a detector misses people for a few frames."""
+    p = waving(60)
+    messages = [
+        raw(
+            10**18 + k * PERIOD_NS,
+            {1: p[k]} | ({2: p[k] + [1, 1, 0]} if k < 20 else {3: p[k]} if k >= 20 + gap else {}),
+        )
+        for k in range(60)
+    ]
+    cleaned, pipeline = clean(messages, max_bodies=2)
+    assert pipeline.counters["too_many_bodies"] == refused
+    here = [[body.id for body in c.bodies] for c in cleaned]
+    assert here[19] == [1, 2]
+    assert here[20 + gap + refused :] == [[1, 3]] * (40 - gap - refused)
+
+
 class TestBadInput:
     """Counted, never raised; and good frames after it are answered as if nothing had been."""
 
