@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import Level, PoseRaw, RawBody
+from steadypose.msgs.types import Level, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
@@ -45,7 +45,7 @@ def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterat
     if newest.skeleton not in SKELETONS:
         yield _unknown(messages)
         return
-    yield from _sensor_pose(newest)
+    yield from check_sensor_pose(newest.sensor_pose)
     skeleton = SKELETONS[newest.skeleton]
     counts = Counter(len(body.positions) for body in bodies(messages))
     if counts and (common := counts.most_common(1)[0][0]) != len(skeleton.joints):
@@ -93,8 +93,8 @@ def _best(messages: Sequence[PoseRaw]) -> tuple[str, int] | None:
     return (best.skeleton, count) if best and best.is_body else None
 
 
-def _sensor_pose(raw: PoseRaw) -> Iterator[Problem]:
-    pose = raw.sensor_pose
+def check_sensor_pose(pose: Pose) -> Iterator[Problem]:
+    """The problem of a sensor pose that cannot be used."""
     norm = float(np.linalg.norm(pose.orientation))
     if not np.isfinite(pose.position).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
         yield error(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from datetime import timedelta
 from numbers import Integral, Real
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from steadypose.msgs.codec import MAX_BODIES
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
-from steadypose.nodes.checks.layout import axes_hint, skeleton_hint
+from steadypose.nodes.checks.layout import axes_hint, check_sensor_pose, skeleton_hint
 from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
@@ -63,7 +64,7 @@ class Filter:
             first. It includes that of frames without a pose: the last person may have left.
 
     Raises:
-        ValueError: an unknown skeleton, axis or setting.
+        ValueError: an unknown skeleton, axis or setting, or a sensor pose that cannot be used.
     """
 
     @suggesting
@@ -126,7 +127,7 @@ class Filter:
 
         Raises:
             FilterError: an array or the ids have the wrong form, or there is not one time of capture, or no sensor
-                pose although the frame before had one; the frame is not used.
+                pose although the frame before had one, or one that cannot be used; the frame is not used.
         """
         found = self.update(joints, t, stamp_ns=stamp_ns, confidence=confidence, ids=ids, sensor_pose=sensor_pose)
         return found[-1] if found else None
@@ -249,6 +250,8 @@ class Filter:
 def _check_pose(pose: object) -> None:
     if not isinstance(pose, Pose | None):
         raise FilterError(f"sensor_pose: expected steadypose.Pose(position, orientation), got {pose!r}")
+    for problem in check_sensor_pose(pose) if pose else ():
+        raise FilterError(problem.text)
 
 
 def _stamp(t: float | None, stamp_ns: int | None) -> int:
@@ -259,9 +262,11 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
             f"expected the time of capture, as t in seconds or as stamp_ns, got {got}: cleaner(joints, time.time())"
         )
     if stamp_ns is not None:
-        if not isinstance(stamp_ns, Real) or stamp_ns != round(stamp_ns):
+        if not isinstance(stamp_ns, Real) or isinstance(stamp_ns, np.timedelta64) or stamp_ns != round(stamp_ns):
             raise FilterError(f"stamp_ns: expected whole nanoseconds, got {stamp_ns!r}; seconds are t")
         return int(stamp_ns)
+    if isinstance(t, timedelta | np.timedelta64):
+        raise FilterError(f"t: expected a number of seconds, got {t!r}; t / np.timedelta64(1, 's')")
     if not isinstance(t, Real) or not math.isfinite(t) or t < 0:
         raise FilterError(f"t: expected seconds of 0 or more, got {t!r}")
     if t >= 2**31:

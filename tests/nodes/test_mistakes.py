@@ -3,6 +3,7 @@
 import sys
 import warnings
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from tests.nodes.conftest import walked, write_npz
 
 import steadypose
+from steadypose import Pose
 from steadypose.nodes.cli import main
 from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.library.arrays import sections, source_of
@@ -126,6 +128,12 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
         lambda j: Filter()(np.concatenate([j, j, j]), 0.0),
         r"got 150; frames go one by one, and a whole recording into steadypose\.clean",
     ),
+    "seconds of numpy": (
+        lambda j: Filter()(j[0], np.timedelta64(100, "ms")),
+        r"t: expected a number of seconds, got .*; t / np\.timedelta64\(1, 's'\)",
+    ),
+    "seconds as a timedelta": (lambda j: Filter()(j[0], timedelta(seconds=1)), "t: expected a number of seconds"),
+    "nanoseconds of numpy": (lambda j: Filter()(j[0], stamp_ns=np.timedelta64(1, "ns")), "expected whole nanoseconds"),
     "seconds as text": (lambda j: Filter()(j[0], "0.1"), "t: expected seconds of 0 or more, got '0.1'"),
     "seconds as nanoseconds": (
         lambda j: Filter()(j[0], stamp_ns=1.7e9 + 0.3),
@@ -140,6 +148,14 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "confidence in words": (
         lambda j: Filter()(j[0], 0.1, confidence=["high"] * 22),
         r"confidence: expected \(1, 22\) numbers of 0 to 1, got <U4 of shape \(22,\)",
+    ),
+    "a quaternion that is not of unit length": (
+        lambda j: Filter(sensor_pose=Pose(np.zeros(3), np.array([0.0, 0, 0, 2]))),
+        "of norm 2; expected finite numbers and a unit quaternion xyzw",
+    ),
+    "one of a frame": (
+        lambda j: Filter()(j[0], 0.0, sensor_pose=Pose(np.zeros(3), np.zeros(4))),
+        "of norm 0; expected finite numbers and a unit quaternion xyzw",
     ),
     "a place for a pose": (lambda j: Filter(sensor_pose=(0.0, 0.0, 1.4)), r"sensor_pose: expected steadypose\.Pose"),
     "a section that is a number": (
