@@ -123,7 +123,11 @@ def _locked(file: TextIO, within_s: float) -> bool:
 
 def _compile(folder: Path, say: Callable[[str], None]) -> None:
     started = reported = time.monotonic()
-    say("compiling the loops for this processor, once; this takes about half a minute on two cores")
+    there = {file.name for other in loop_cache.readable() for file in other.iterdir()} - {loop_cache.COMPLETE}
+    if there:
+        say("the program has changed since the loops were compiled: loading them, and compiling what is not there")
+    else:
+        say("compiling the loops for this processor, once; this takes about half a minute on two cores")
     ready: set[str] = set()
     reading, writing = os.pipe()
     with tempfile.TemporaryFile("w+") as errors:
@@ -161,7 +165,8 @@ def _compile(folder: Path, say: Callable[[str], None]) -> None:
     except OSError as error:
         say(f"compiled loops cannot be kept in {folder}: {error.strerror}")
         return
-    say(f"compiled {len(ready)} loops in {time.monotonic() - started:.0f} s, once")
+    loaded = f", loaded {len(ready & there)}" * bool(ready & there)
+    say(f"compiled {len(ready - there)} loops{loaded} in {time.monotonic() - started:.0f} s, once")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics
+from steadypose.nodes.graph import loops as loops_module
 from steadypose.nodes.graph import trajectory_node
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.loops import _locked, compile_from_the_beginning, compile_from_the_end
@@ -26,6 +27,7 @@ from steadypose.nodes.graph.run_state import HEALTH_FILE, RunLock
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
+from steadypose.prior import loop_cache
 
 pytestmark = pytest.mark.slow
 
@@ -51,6 +53,23 @@ def test_nohup_is_obeyed() -> None:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def test_loops_that_are_loaded_are_not_said_to_be_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    told = "import os, sys; os.write(int(sys.argv[1]), b'one\\ntwo\\nthree\\n')"
+    monkeypatch.setattr(loops_module, "own_command", lambda _, part, pipe: [sys.executable, "-c", told, pipe])
+    (folder,) = loop_cache.folders()
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(loop_cache, "writable", lambda: folder)  # which is cached
+    for name, loaded in (("", "3 loops"), ("two", "2 loops, loaded 1")):
+        if name:
+            (folder / name).touch()
+        (folder / loop_cache.COMPLETE).unlink(missing_ok=True)
+        said: list[str] = []
+        loops_module.compile_missing(said.append)
+        assert ("has changed" in said[0]) == bool(name)
+        assert said[-1].startswith(f"compiled {loaded} in ")
 
 
 def test_a_second_run_is_refused_and_the_first_is_left_alone(start: Any, recording: Path, folder: Path) -> None:
