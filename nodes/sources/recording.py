@@ -169,29 +169,25 @@ class CsvSource:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.refused: Counter[str] = Counter()
-        lines = _lines(path)
-        header = _notes(path, lines)
-        numbered = [
-            (number, line) for number, line in enumerate(lines, start=1) if line.strip() and not line.startswith("#")
-        ]
-        rows = csv.reader(line for _, line in numbered)
+        notes = _notes(path)
+        numbers: list[int] = []
+        rows = csv.reader(_table(path, numbers))
         try:
             columns = [name.strip() for name in next(rows, [])]
-            cells = [(numbered[rows.line_num - 1][0], row) for row in rows]
+            if not columns:
+                raise CsvError(
+                    f"{path}: has no rows: expected a header, stamp, JOINT_x, JOINT_y, JOINT_z, ..., and a row a frame"
+                )
+            self._skeleton = _skeleton(path, columns, notes.get("skeleton"))
+            self._frames = self._read(((numbers[rows.line_num - 1], row) for row in rows), columns)
         except csv.Error as error:
             raise CsvError(f"{path}: cannot be read as CSV: {error}") from error
-        if not columns:
-            raise CsvError(
-                f"{path}: has no rows: expected a header, stamp, JOINT_x, JOINT_y, JOINT_z, ..., and a row a frame"
-            )
-        self._skeleton = _skeleton(path, columns, header.get("skeleton"))
-        if not cells:
+        if not self._frames and not self.refused:
             raise CsvError(f"{path}: has a header, but no rows: expected one for each frame, and for each body in it")
         try:
-            self._sensor_pose = Pose.from_up(header.get("up", "z"))
+            self._sensor_pose = Pose.from_up(notes.get("up", "z"))
         except ValueError as error:
             raise CsvError(f"{path}: {error}") from error
-        self._frames = self._read(cells, columns)
         if not self._frames:
             raise CsvError(
                 f"{path}: expected at least one row of numbers after the header, got none that can be read: "
@@ -208,23 +204,22 @@ class CsvSource:
             )
             yield POSE_RAW, message
 
-    def _read(self, rows: list[tuple[int, list[str]]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
+    def _read(self, rows: Iterable[tuple[int, list[str]]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
         """Stamp and bodies of each frame, in file order, from the numbers of rows in the file and their cells."""
         positions = _columns(columns, self._skeleton, AXES)
         confidence = _columns(columns, self._skeleton, ("confidence",))
         stamp, body = columns.index("stamp"), columns.index("body") if "body" in columns else -1
         used = sorted({stamp, body, *positions.flat, *confidence.flat} - {-1})
-        complete = [(number, row) for number, row in rows if len(row) == len(columns)]
-        _check_unit(self.path, [row[stamp] for _, row in complete])
+        stamps: list[str] = []
         refused: dict[str, list[str]] = {}
-        for number, row in rows:
-            if len(row) != len(columns):
-                where = f"row {number}: {len(row)} cells for {len(columns)} columns"
-                refused.setdefault("rows of another length than the header", []).append(where)
         read: list[tuple[int, RawBody]] = []
         numbers = np.full(len(columns) + 1, np.nan)  # the last stands for missing columns, whose index is -1
-        for number, row in complete:
+        for number, row in rows:
             try:
+                if len(row) != len(columns):
+                    where = f"row {number}: {len(row)} cells for {len(columns)} columns"
+                    raise _RowError("rows of another length than the header", where)
+                stamps.append(row[stamp])
                 for index in used:
                     numbers[index] = _number(number, columns[index], row[index])
                 stamp_ns = _stamp_ns(number, float(numbers[stamp]))
@@ -236,6 +231,7 @@ class CsvSource:
             confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
             with np.errstate(over="ignore"):
                 read.append((stamp_ns, RawBody(id, joints, confidences)))
+        _check_unit(self.path, stamps)
         self.refused.update({f"{cause}, first {where[0]}": len(where) for cause, where in refused.items()})
         return [(stamp_ns, [one for _, one in group]) for stamp_ns, group in groupby(read, key=lambda pair: pair[0])]
 
@@ -271,23 +267,35 @@ def _id(row: int, body: float) -> int:
     return int(body)
 
 
-def _lines(path: Path) -> list[str]:
+def _lines(path: Path) -> Iterator[str]:
     """The lines of a text file in UTF-8."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with path.open(encoding="utf-8-sig") as file:
+            for line in file:
+                if "\0" in line:  # UTF-16 without a mark at its beginning
+                    raise CsvError(
+                        f"{path}: cannot be read as text: expected UTF-8, got characters of 0; save it as UTF-8"
+                    )
+                yield line.rstrip("\n")
     except UnicodeDecodeError as error:
         raise CsvError(f"{path}: cannot be read as text: {error}; save it as UTF-8") from error
     except OSError as error:
         raise CsvError(f"{path}: cannot be read as text: {error}") from error
-    if "\0" in text:  # UTF-16 without a mark at its beginning
-        raise CsvError(f"{path}: cannot be read as text: expected UTF-8, got characters of 0; save it as UTF-8")
-    return text.splitlines()
 
 
-def _notes(path: Path, lines: list[str]) -> dict[str, str]:
+def _table(path: Path, numbers: list[int]) -> Iterator[str]:
+    """The lines of header and rows; their numbers in the file are appended to ``numbers``. They come one at a time,
+    because cells as text take ten times the memory of numbers."""
+    for number, line in enumerate(_lines(path), start=1):
+        if line.strip() and not line.startswith("#"):
+            numbers.append(number)
+            yield line
+
+
+def _notes(path: Path) -> dict[str, str]:
     """The values of the lines ``# KEY: VALUE``, by key."""
     notes = {}
-    for line in lines:
+    for line in _lines(path):
         if not line.startswith("#"):
             continue
         key, colon, value = line[1:].partition(":")

@@ -1,3 +1,4 @@
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -189,3 +190,14 @@ def test_a_csv_is_played_as_an_npz_of_the_same_poses(tmp_path: Path) -> None:
     played = open_recording(tmp_path / "x.csv")
     assert len(played) == len(stream)
     assert list(played) == list(open_recording(tmp_path / "x.npz"))
+
+
+def test_a_long_file_is_not_held_as_text(tmp_path: Path) -> None:
+    rows = (row(k / 100, np.full((22, 3), k / 1000)) for k in range(2000))
+    path = write(tmp_path / "x.csv", HEADER, *rows)
+    tracemalloc.start()
+    try:
+        assert len(CsvSource(path)) == 2000
+        assert tracemalloc.get_traced_memory()[1] < 3 * path.stat().st_size
+    finally:
+        tracemalloc.stop()
