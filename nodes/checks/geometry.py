@@ -16,6 +16,7 @@ from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.admission import MAX_DISTANCE
 
 ENOUGH = 15
 """Smallest number of messages to judge by."""
@@ -226,8 +227,6 @@ def _unit(like: Likeness) -> Problem:
 
 def _far(joints: Floats) -> Iterator[Problem]:
     """The problem of bodies, joints (N, J, 3), of which most joints are too far from the sensor to be used."""
-    from steadypose.prior.clean.adapt import MAX_DISTANCE  # imported late: loads 95 MB of numba
-
     away = np.nanmedian(np.abs(joints).max(axis=-1), axis=1)
     far = away[np.isfinite(away)] > MAX_DISTANCE
     if far.sum() >= ENOUGH:

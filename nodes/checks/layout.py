@@ -15,6 +15,7 @@ from steadypose.msgs.types import Level, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, warning
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
 from steadypose.prior.body.likeness import likenesses
+from steadypose.prior.clean.admission import MAX_PLACE
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.settings import nearest
 
@@ -104,8 +105,6 @@ def check_sensor_pose(pose: Pose) -> Iterator[Problem]:
             "quaternion xyzw: Pose.from_up('-y') for a level camera, 0 0 0 1 if z is up",
         )
         return
-    from steadypose.prior.clean.adapt import MAX_PLACE  # imported late: loads 95 MB of numba
-
     if not (farthest := float(np.abs(pose.position).max())) < MAX_PLACE:
         yield error(
             "sensor_pose",

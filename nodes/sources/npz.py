@@ -11,6 +11,7 @@ For several bodies: ``positions`` (T, B, J, 3), all NaN where a body is absent; 
 from __future__ import annotations
 
 import difflib
+import logging
 import zipfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -36,7 +37,10 @@ from steadypose.msgs.types import (
 from steadypose.nodes.checks.layout import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
 from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.clean.admission import MAX_DISTANCE
 from steadypose.prior.npz import check_arrays
+
+logger = logging.getLogger(__name__)
 
 CLEANED = ("world_positions", "state")
 """Names of arrays that an output has and an input lacks."""
@@ -295,7 +299,9 @@ SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")
 class MotionSource(ArraySource):
     """The body in a motion capture file, in canonical joints, z up.
 
-    ``rig`` says what the file itself lacks (`prior.mocap.files.Description`), as a TOML table.
+    ``rig`` says what the file itself lacks (`prior.mocap.files.Description`), as a TOML table. A body far from the
+    file's origin is given relative to the middle of its path, where the sensor is then said to be; the world is
+    the file's.
 
     Raises:
         MotionError: the file cannot be read, or no body is recognised in it.
@@ -305,7 +311,26 @@ class MotionSource(ArraySource):
         from steadypose.prior.mocap.files import describe, read_motion  # imported late, because it imports scipy
 
         fps, positions = read_motion(path.name, path.read_bytes(), describe(rig))
-        super().__init__(path, {"positions": positions, "skeleton": np.array(CANONICAL.name), "fps": np.array(fps)})
+        place = _middle(positions)
+        arrays = {"positions": positions - place, "skeleton": np.array(CANONICAL.name), "fps": np.array(fps)}
+        super().__init__(path, arrays)
+        self._sensor_pose = Pose(place, self._sensor_pose.orientation)
+        if place.any():
+            logger.warning(
+                "%s: the body is far from the origin: its positions are relative to %s m, those in the world are the "
+                "file's",
+                path,
+                place.round(2).tolist(),
+            )
+
+
+def _middle(positions: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(3,) metres: the middle of the joints (T, J, 3), along axes on which they are too far away to be used; else 0."""
+    joints = positions[np.isfinite(positions).all(axis=-1)]
+    if not len(joints):
+        return np.zeros(3)
+    ends = np.percentile(joints.astype(np.float64), [1, 99], axis=0)  # some joints may be anywhere
+    return np.where(np.abs(ends).max(axis=0) > MAX_DISTANCE, ends.mean(axis=0), 0.0)
 
 
 def holds_motion(path: Path) -> bool:

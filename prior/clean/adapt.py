@@ -15,13 +15,10 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import SensorFrame, quaternions
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
+from steadypose.prior.clean.admission import MAX_DISTANCE, MAX_PLACE
 from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.compiled import median
 
-MAX_DISTANCE = 30.0
-"""Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
-MAX_PLACE = 10_000.0
-"""Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
 MIN_SIZE, MAX_SIZE, MIN_BONES = 0.05, 2.5, 4
 """Least and largest median ratio of a body's bone lengths to the mean person's; least number of observed bones to judge
 it. Some trackers give every joint the same position, often zero, in frames in which they fail."""

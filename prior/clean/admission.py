@@ -12,6 +12,10 @@ import numpy as np
 
 from steadypose.msgs.types import Pose, PoseRaw
 
+MAX_DISTANCE = 30.0
+"""Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
+MAX_PLACE = 10_000.0
+"""Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
 LASTING = 3
 """Number of consecutive messages with increasing stamps after which a jump of stamps is accepted. The source paused, or
 its clock was set."""

@@ -18,6 +18,7 @@ from steadypose.nodes.sources.npz import NpzError, NpzSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource, open_recording
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.prior.clean.admission import MAX_DISTANCE
 
 MakeLaunch = Callable[..., Launch]
 SECOND_NS = 1_000_000_000
@@ -238,3 +239,18 @@ def test_an_npz_gives_a_message_a_row(tmp_path: Path) -> None:
     assert messages[0].skeleton == "coco17"
     assert not messages[0].calibrated
     np.testing.assert_allclose(messages[0].sensor_pose.orientation, [-np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+@pytest.mark.parametrize(("start", "sensor"), [(-25.0, 0.0), (0.0, 25.0), (300.0, 325.0)])
+def test_motion_capture_may_be_anywhere(start: float, sensor: float, tmp_path: Path) -> None:
+    """Somebody goes 50 m, from anywhere, and stays where the file has it in the world."""
+    path = tmp_path / "walk.npz"
+    trans = np.linspace([start, 0.0, 0.9], [start + 50.0, 0.0, 0.9], 100)
+    poses = np.tile([np.pi / 2, *[0.0] * 65], (100, 1))
+    np.savez(path, poses=poses, trans=trans, mocap_framerate=30.0)
+    raws = [message for _, message in open_recording(path) if isinstance(message, PoseRaw)]
+    seen = np.array([raw.bodies[0].positions for raw in raws])
+    places = np.array([raw.sensor_pose.position for raw in raws])
+    assert np.abs(seen).max() < MAX_DISTANCE
+    np.testing.assert_allclose(places, np.tile([sensor, 0.0, 0.0], (100, 1)), atol=0.5)
+    np.testing.assert_allclose(seen[:, 0] + places, trans, atol=1e-4)
