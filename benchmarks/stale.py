@@ -9,9 +9,7 @@ STALE = {
     **dict.fromkeys(
         (
             "humor",
-            "kinect_vicon",
             "restart",
-            "rotations",
             "scale",
         ),
         _TRAINED_ON,
