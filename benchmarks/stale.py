@@ -8,7 +8,6 @@ _TRAINED_ON = (
 STALE = {
     **dict.fromkeys(
         (
-            "humor",
             "restart",
             "scale",
         ),
