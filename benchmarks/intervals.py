@@ -50,26 +50,26 @@ def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) ->
     return np.bincount(person, values[known]) / np.bincount(person)
 
 
-def interval(values: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
+def interval(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> Interval:
     """Return the mean over people of clips' values (N,), NaN where a clip has none, and its 95 % interval."""
-    return _interval(people_means(values, people), seed)
+    return _interval(people_means(values, people))
 
 
-def ratio(values: ArrayLike, baseline: ArrayLike, people: Sequence[str] | NDArray[np.str_], seed: int = 0) -> Interval:
+def ratio(values: ArrayLike, baseline: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> Interval:
     """Return the ratio of two methods' values (N,), above zero, on the same clips, with its interval: the geometric
     mean of the people's own ratios. A clip counts if both have a value.
     """
     values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
     both = np.isfinite(values) & np.isfinite(baseline)
     own = (people_means(np.where(both, v, np.nan), people) for v in (values, baseline))
-    found = _interval(np.log(np.divide(*own)), seed)
+    found = _interval(np.log(np.divide(*own)))
     return found._replace(mean=float(np.exp(found.mean)), low=float(np.exp(found.low)), high=float(np.exp(found.high)))
 
 
-def _interval(means: NDArray[np.float64], seed: int) -> Interval:
+def _interval(means: NDArray[np.float64]) -> Interval:
     count = len(means)
     if count < 2:
         return Interval(float(means[0]) if count else np.nan, np.nan, np.nan, count)
-    drawn = np.random.default_rng(seed).integers(count, size=(DRAWS, count))
+    drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
     low, high = np.quantile(means[drawn].mean(axis=1), (0.025, 0.975))
     return Interval(float(means.mean()), float(low), float(high), count)

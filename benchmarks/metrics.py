@@ -118,15 +118,3 @@ def npss(estimate: Floats, truth: Floats) -> float:
     total = power[0].sum(axis=1)
     shares = [np.cumsum(p / np.maximum(p.sum(axis=1, keepdims=True), 1e-12), axis=1) for p in power]
     return float((np.abs(shares[1] - shares[0]).sum(axis=1) * total).sum() / total.sum())
-
-
-def body_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
-    """Return the trunk's axes forward, left and up as columns: (..., 3, 3), of joints (..., 3). Up runs from the hips
-    to the shoulders.
-    """
-    up = left_shoulder + right_shoulder - left_hip - right_hip
-    up = up / np.linalg.norm(up, axis=-1, keepdims=True)
-    left = left_shoulder - right_shoulder + left_hip - right_hip
-    left = left - (left * up).sum(axis=-1, keepdims=True) * up
-    left = left / np.linalg.norm(left, axis=-1, keepdims=True)
-    return np.stack([np.cross(left, up), left, up], axis=-1)

@@ -77,55 +77,19 @@ class Study(Protocol):
 
 
 def show(table: Table, console: Console) -> None:
-    """Print a table. No figure is broken; columns that exceed the console's width follow below.
-
-    If all rows are named ``group: method``, each group has a line of its own above its methods.
-    """
-    labels = [row[0].partition(": ") for row in table.rows]
-    grouped = all(name for _, _, name in labels)
-    names = [f"  {name}" for _, _, name in labels] if grouped else [row[0] for row in table.rows]
-    first = min(max(map(len, [table.columns[0], *names])), console.width // 3)
-    room = console.width - first
-    for number, columns in enumerate(_blocks(table, room)):
-        in_a_line = [max(_width(table, column), len(table.columns[column])) + 2 for column in columns]
-        wraps = sum(in_a_line) > room
-        grid = RichTable(
-            title=None if number else table.title, title_justify="left", box=None, pad_edge=False, header_style="bold"
-        )
-        grid.add_column(table.columns[0], width=first, overflow="fold")
-        for column, whole in zip(columns, in_a_line, strict=True):
-            width = _width(table, column) if wraps else whole - 2
-            grid.add_column(table.columns[column], justify="right", width=width)
-        last = None
-        for name, (group, _, _), row in zip(names, labels, table.rows, strict=True):
-            if grouped and group != last:
-                grid.add_row(group, *("" for _ in columns))
-                last = group
-            grid.add_row(name, *(row[column] for column in columns))
-        console.print(grid)
+    """Print a table, each row in one line, however narrow the console."""
+    grid = RichTable(box=None, pad_edge=False, header_style="bold")
+    for number, column in enumerate(table.columns):
+        grid.add_column(column, justify="right" if number else "left", no_wrap=True)
+    for row in table.rows:
+        grid.add_row(*row)
+    wide = Console(width=1000)
+    with wide.capture() as lines:
+        wide.print(grid)
+    console.print(f"{table.title}\n{lines.get()}", soft_wrap=True, markup=False, highlight=False, end="")
     if table.note:
         console.print(table.note, style="dim", highlight=False)
     console.print()
-
-
-def _width(table: Table, column: int) -> int:
-    """Return the width that a column of figures needs, characters: its longest cell or the longest word of its
-    header."""
-    return max(len(text) for text in (*table.columns[column].split(), *(row[column] for row in table.rows)))
-
-
-def _blocks(table: Table, width: int) -> list[list[int]]:
-    """Split the columns of figures into blocks that each fit into ``width`` characters."""
-    blocks: list[list[int]] = [[]]
-    left = width
-    for column in range(1, len(table.columns)):
-        needed = _width(table, column) + 2
-        if needed > left and blocks[-1]:
-            blocks.append([])
-            left = width
-        blocks[-1].append(column)
-        left -= needed
-    return blocks
 
 
 def save(

@@ -16,12 +16,12 @@ from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.kalman import fixed_lag
-from steadypose.benchmarks.metrics import body_frame
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.recordings import trunk_frame
 
 _FRAMES, _MAX_AHEAD = 24, 4
 _BATCH = 128
@@ -76,7 +76,7 @@ def smoothed(clips: Sequence[Floats], scored: Sequence[int], delay: int, ahead: 
 
 
 def _trunk(canonical: Floats) -> Floats:
-    return body_frame(*(canonical[:, J[name]] for name in _CORNERS))
+    return trunk_frame(*(canonical[:, J[name]] for name in _CORNERS))
 
 
 def _in_trunk(kinect: Floats) -> Floats:

@@ -7,7 +7,6 @@ three times as large along the line of sight.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -42,17 +41,13 @@ CAMERA = (3.0, 0.0, 1.2)
 def conditions(quick: bool) -> dict[str, Callable[[Floats, np.random.Generator], Floats]]:
     """Return corruptions of joints (T, C, 22, 3) before a camera at the origin, by name."""
     levels = (0.0, 0.01) if quick else NOISES_M
-    same = {_noise_name(level): partial(_independent, level) for level in levels}
-    more = {f"{_noise_name(level)}, depth x3": partial(_deep, level) for level in levels if level}
+    same = {_noise_name(level): lambda truth, rng, level=level: gaussian(truth, level, rng) for level in levels}
+    more = {
+        f"{_noise_name(level)}, depth x3": lambda truth, rng, level=level: along_sight(truth, level, rng)
+        for level in levels
+        if level
+    }
     return {**same, **({} if quick else more)}
-
-
-def _independent(level: float, truth: Floats, rng: np.random.Generator) -> Floats:
-    return gaussian(truth, level, rng)
-
-
-def _deep(level: float, truth: Floats, rng: np.random.Generator) -> Floats:
-    return along_sight(truth, level, rng)
 
 
 def _noise_name(level: float) -> str:

@@ -40,19 +40,16 @@ _STREAMS = ROOT / "sim_data"
 def run(bench: Bench) -> Result:
     """Run every method on the Kinect; then aimed bones and steadypose on the bundled streams."""
     roots = baselines(bench.training_clips(), bench.seeds[0])
-    kinect, bundled = _kinect(bench, roots), _bundled({name: METHODS[name] for name in (AIMED, STEADYPOSE)})
+    kinect = _kinect(bench, roots)
+    bundled = {
+        path.parent.name: {name: _errors(path.parent, METHODS[name]) for name in (AIMED, STEADYPOSE)}
+        for path in sorted(_STREAMS.glob("*/metadata.yaml"))
+    }
     return Result([_kinect_table(kinect), _bundled_table(bundled)], {"kinect": kinect, "bundled": bundled})
 
 
-def _bundled(methods: Mapping[str, PriorSettings]) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Return errors of root, heading and tilt by stream and method: median and 95th percentile, degrees."""
-    return {
-        path.parent.name: {name: _errors(path.parent, settings) for name, settings in methods.items()}
-        for path in sorted(_STREAMS.glob("*/metadata.yaml"))
-    }
-
-
 def _errors(path: Path, settings: PriorSettings) -> dict[str, list[float]]:
+    """Return errors of root, heading and tilt in a stream: median and 95th percentile, degrees."""
     prior, raw, truth = PriorPipeline(settings), [], {}
     for _, message in open_recording(path):
         if isinstance(message, PoseRaw):

@@ -19,7 +19,6 @@ from sklearn.metrics import roc_auc_score
 from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import (
     acceleration_error,
-    body_frame,
     length_variation,
     position_error,
     sigma_ratio,
@@ -28,6 +27,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, J
+from steadypose.training.data.recordings import trunk_frame
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
 
 SUBJECTS = TRAIN_SUBJECTS + VALIDATION_SUBJECTS
@@ -124,7 +124,7 @@ def move(estimate: Floats, offset: Floats) -> Floats:
 
 def _trunk(positions: Floats) -> Floats:
     corners = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-    return body_frame(*(positions[:, SCORED.index(name)] for name in corners))
+    return trunk_frame(*(positions[:, SCORED.index(name)] for name in corners))
 
 
 def quick_score(clips: Sequence[Clip], answers: Sequence[Floats]) -> dict[str, float]:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import numpy as np
-
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines import flk
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
@@ -27,39 +25,18 @@ from steadypose.benchmarks.studies.corrupted import (
     reliability_bins,
     run_conditions,
 )
-from steadypose.prior.arrays import Floats
 
 DEPENDS_ON = VARIANTS_22
 
 LEVELS_CM = (1, 2, 4, 8)
 
 
-def _independent(truth: Floats, rng: np.random.Generator, level_cm: int) -> Floats:
-    return gaussian(truth, level_cm / 100, rng)
-
-
-def _lasting(truth: Floats, rng: np.random.Generator) -> Floats:
-    return correlated(truth, 0.02, rng)
-
-
-def _with_spikes(truth: Floats, rng: np.random.Generator) -> Floats:
-    return spiked(gaussian(truth, 0.01, rng), rng)
-
-
-def _with_swaps(truth: Floats, rng: np.random.Generator) -> Floats:
-    return swapped(gaussian(truth, 0.01, rng), rng)
-
-
-def _with_all(truth: Floats, rng: np.random.Generator) -> Floats:
-    return spiked(swapped(correlated(truth, 0.02, rng), rng), rng)
-
-
 CONDITIONS: dict[str, Condition] = {
-    **{f"{level} cm": partial(_independent, level_cm=level) for level in LEVELS_CM},
-    "lasting 2 cm": _lasting,
-    "1 cm, spikes": _with_spikes,
-    "1 cm, swaps": _with_swaps,
-    "lasting 2 cm, spikes, swaps": _with_all,
+    **{f"{cm} cm": lambda truth, rng, cm=cm: gaussian(truth, cm / 100, rng) for cm in LEVELS_CM},
+    "lasting 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
+    "1 cm, spikes": lambda truth, rng: spiked(gaussian(truth, 0.01, rng), rng),
+    "1 cm, swaps": lambda truth, rng: swapped(gaussian(truth, 0.01, rng), rng),
+    "lasting 2 cm, spikes, swaps": lambda truth, rng: spiked(swapped(correlated(truth, 0.02, rng), rng), rng),
 }
 """Conditions by standard deviation along an axis; "lasting": correlation 0.9 between frames."""
 

@@ -15,6 +15,7 @@ from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.models.root_velocity import FRAME_S
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.world.observe import FEET
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
@@ -37,8 +38,6 @@ class Way(NamedTuple):
 
     positions: Floats
     """(T, 22, 3) metres"""
-    velocity: Floats
-    """(T, 3) m/s, the root's"""
     sigma: Floats
     """(T, 3) metres, the root's standard deviation"""
 
@@ -53,7 +52,6 @@ def fusion(settings: TrajectorySettings, messages: Sequence[PoseClean]) -> Way:
     bodies = [pipeline.process(message)[0].bodies[0] for message in messages]
     return Way(
         np.stack([b.positions for b in bodies]).astype(np.float64),
-        np.stack([b.root_velocity for b in bodies]),
         np.sqrt(np.stack([np.diag(b.covariance)[:3] for b in bodies])),
     )
 
@@ -83,13 +81,6 @@ class Clip:
         return np.arange(len(self.positions)) % (SEEN_FRAMES + HIDDEN_FRAMES) >= SEEN_FRAMES
 
 
-def _lasting_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    noise = rng.normal(size=shape)
-    for t in range(1, shape[0]):
-        noise[t] = MEMORY * noise[t - 1] + np.sqrt(1.0 - MEMORY**2) * noise[t]
-    return noise
-
-
 def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
     """Return a clip as a prior's output: with noise, and without the trunk where `Clip.hidden`.
 
@@ -97,9 +88,9 @@ def observe(clip: Clip, rng: np.random.Generator) -> list[PoseClean]:
     body's own motion is known, which is the task of HM-VAE's section 3.3.
     """
     count = len(clip.positions)
-    root = clip.positions[:, 0] + ROOT_NOISE * _lasting_noise((count, 3), rng)
+    root = clip.positions[:, 0] + ROOT_NOISE * time_correlated(rng.normal(size=(count, 3)), MEMORY)
     local = clip.positions - clip.positions[:, :1]
-    local[:, 1:] += JOINT_NOISE * _lasting_noise((count, 21, 3), rng)
+    local[:, 1:] += JOINT_NOISE * time_correlated(rng.normal(size=(count, 21, 3)), MEMORY)
     sigma = np.full((count, 22), np.hypot(ROOT_NOISE, JOINT_NOISE))
     sigma[:, 0] = np.where(clip.hidden, np.inf, ROOT_NOISE)
     trunk = [j for j in range(22) if j not in (4, 5, 7, 8, 10, 11, 20, 21)]
@@ -123,21 +114,18 @@ class Errors:
     """Errors of one method over clips; lists hold one number per frame or span."""
 
     seen_position: list[float] = field(default_factory=list)
-    seen_velocity: list[float] = field(default_factory=list)
     seen_skate: list[float] = field(default_factory=list)
     hidden_skate: list[float] = field(default_factory=list)
     hidden_position: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
     hidden_nees: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
     hidden_path: list[float] = field(default_factory=list)
 
-    def add(self, clip: Clip, positions: Floats, velocity: Floats, sigma: Floats) -> None:
-        """Compare (T, 22, 3) metres, (T, 3) m/s and (T, 3) metres, the root's standard deviation, with the truth."""
+    def add(self, clip: Clip, positions: Floats, sigma: Floats) -> None:
+        """Compare (T, 22, 3) metres and (T, 3) metres, the root's standard deviation, with the truth."""
         hidden, truth = clip.hidden, clip.positions[:, 0]
         off = positions[:, 0] - truth
-        true_velocity = np.gradient(truth, FRAME_S, axis=0)
         settled = np.arange(len(hidden)) >= 10
         self.seen_position += list(np.linalg.norm(off[~hidden & settled], axis=1))
-        self.seen_velocity += list(np.linalg.norm((velocity - true_velocity)[~hidden & settled], axis=1))
         speed = np.linalg.norm(np.diff(positions[:, FEET, :2], axis=0), axis=2) / FRAME_S
         labels = clip.contacts[:, [CONTACT_JOINTS.index(j) for j in FEET]]
         stands = labels[1:] & labels[:-1] & settled[1:, None]
@@ -158,7 +146,6 @@ class Errors:
         walked = path > 1.0
         return {
             "seen: root cm": 100 * _rms(self.seen_position),
-            "seen: velocity m/s": _rms(self.seen_velocity),
             "seen: skate m/s": float(np.mean(self.seen_skate)),
             "hidden: skate m/s": float(np.mean(self.hidden_skate)),
             **{f"hidden {h * FRAME_S:g} s: root cm": 100 * _rms(e) for h, e in self.hidden_position.items()},
@@ -176,14 +163,13 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def evaluate_fusion(clips: list[Clip], methods: Mapping[str, Method], seed: int = 0) -> dict[str, Errors]:
-    """Run every method over every clip; "as observed" is the input, with velocity from differences of frames."""
+def evaluate_fusion(clips: list[Clip], methods: Mapping[str, Method]) -> dict[str, Errors]:
+    """Run every method over every clip; "as observed" is the input."""
     errors = {name: Errors() for name in ("as observed", *methods)}
     for number, clip in enumerate(clips):
-        messages = observe(clip, np.random.default_rng((seed, number)))
+        messages = observe(clip, np.random.default_rng((0, number)))
         seen = np.stack([m.bodies[0].positions for m in messages]).astype(np.float64)
-        velocity = np.gradient(seen[:, 0], FRAME_S, axis=0)
-        errors["as observed"].add(clip, seen, velocity, np.full((len(seen), 3), ROOT_NOISE))
+        errors["as observed"].add(clip, seen, np.full((len(seen), 3), ROOT_NOISE))
         for name, method in methods.items():
             errors[name].add(clip, *method(messages))
     return errors

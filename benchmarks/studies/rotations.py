@@ -29,7 +29,7 @@ from steadypose.benchmarks.baselines.rotations import (
 )
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
-from steadypose.benchmarks.intervals import Interval, ratio
+from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped, starts_of
@@ -111,16 +111,12 @@ def run(bench: Bench) -> Result:
             off = np.degrees(np.median(angle(own[scored, :, 0].swapaxes(-1, -2) @ found.orientations[scored, :, 0]), 0))
             plain = off if method == AIMED else plain
             record["root, of aimed bones'"] = (
-                _rounded(ratio(off, plain, clips.person)) if condition != PERFECT else None
+                [round(v, 3) for v in ratio(off, plain, clips.person)[:3]] if condition != PERFECT else None
             )
             records.append(record)
     data = {"clips": {source: int((clips.source == source).sum()) for source in np.unique(clips.source)},
             "people": len(set(clips.person)), "records": records}  # fmt: skip
     return Result([_table(records, tuple(roots)), _bends(records)], data)
-
-
-def _rounded(found: Interval) -> list[float]:
-    return [round(value, 3) for value in (found.mean, found.low, found.high)]
 
 
 def best_density(truth: Floats, corrupt: Callable[[Floats, np.random.Generator], Floats]) -> float:

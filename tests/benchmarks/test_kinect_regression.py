@@ -12,11 +12,12 @@ from steadypose.benchmarks.baselines.kinect_regression import (
     smoothed,
     temporal_convolution,
 )
-from steadypose.benchmarks.metrics import body_frame, position_error
+from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
+from steadypose.training.data.recordings import trunk_frame
 
 SIZES = np.random.default_rng(0).normal(0, 0.3, (len(SCORED), 3))
 WAYS = np.random.default_rng(2).normal(0, 0.2, (3, 66))
@@ -70,7 +71,7 @@ def test_a_clip_is_smoothed_with_the_part_of_the_delay_that_is_not_looked_ahead(
             late, early = (fixed_lag(clip[:, None], np.arange(len(clip)) / 30, d, 2, 2.0)[:, 0] for d in (4, 4 - ahead))
             bodies = [to_canonical(KINECT22, seen)[0] for seen in (late, early)]
             corners = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-            trunks = [body_frame(*(body[:, J[name]] for name in corners)) for body in bodies]
+            trunks = [trunk_frame(*(body[:, J[name]] for name in corners)) for body in bodies]
             np.testing.assert_allclose(one.answer, bodies[0][:, scored])
             np.testing.assert_allclose(one.trunk, trunks[0])
             hips = (bodies[1][:, J["left_hip"]] + bodies[1][:, J["right_hip"]])[:, None] / 2

@@ -4,7 +4,6 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.metrics import (
     acceleration_error,
-    body_frame,
     contact_speed,
     length_variation,
     position_error,
@@ -13,6 +12,7 @@ from steadypose.benchmarks.metrics import (
     sigma_ratio,
 )
 from steadypose.prior.body.kinematics import rigid_alignment
+from steadypose.training.data.recordings import trunk_frame
 
 
 def walk(seed: int, frames: int = 12, joints: int = 5) -> np.ndarray:
@@ -68,13 +68,13 @@ def test_rigid_alignment_is_scipys_leaves_out_what_is_missing_and_never_mirrors(
         rigid_alignment(a[:2], b[:2])
 
 
-def test_body_frame_turns_with_the_body() -> None:
+def test_trunk_frame_turns_with_the_body() -> None:
     corners = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.02, 0.2, 0.5], [0.02, -0.2, 0.5]])
-    upright = body_frame(*corners)
+    upright = trunk_frame(*corners)
     np.testing.assert_allclose(upright[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
     assert upright[2, 2] > 0.99
     rotation = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
-    np.testing.assert_allclose(body_frame(*(corners @ rotation.T + 3.0)), rotation @ upright, atol=1e-12)
+    np.testing.assert_allclose(trunk_frame(*(corners @ rotation.T + 3.0)), rotation @ upright, atol=1e-12)
     np.testing.assert_allclose(upright.T @ upright, np.eye(3), atol=1e-12)
 
 

@@ -161,7 +161,7 @@ def _pairs(path: Path) -> Pairs:
             kinect = to_canonical(KINECT22, pair.kinect)[0]
             rotation, translation = rigid_alignment(kinect[:, _ALIGNED], pair.vicon[:, _ALIGNED])
             aligned.append(kinect @ rotation.T + translation)
-        frames = [trunk_frame(pair.vicon) for pair in clips]
+        frames = [trunk_frame(*(pair.vicon[:, J[name]] for name in _TRUNK)) for pair in clips]
         apart = [
             np.einsum("tba,tjb->tja", frame, kinect - pair.vicon)
             for frame, kinect, pair in zip(frames, aligned, clips, strict=True)
@@ -175,9 +175,10 @@ def _pairs(path: Path) -> Pairs:
     return Pairs(np.concatenate(seen), np.concatenate(truth), start, np.array(names))
 
 
-def trunk_frame(positions: Floats) -> Floats:
-    """Return the trunk's axes forward, left, up as columns (..., 3, 3), from joints (..., 22, 3)."""
-    left_hip, right_hip, left_shoulder, right_shoulder = (positions[..., J[name], :] for name in _TRUNK)
+def trunk_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
+    """Return the trunk's axes forward, left and up as columns: (..., 3, 3), of joints (..., 3). Up runs from the hips
+    to the shoulders.
+    """
     up = left_shoulder + right_shoulder - left_hip - right_hip
     up = up / np.linalg.norm(up, axis=-1, keepdims=True)
     left = left_shoulder - right_shoulder + left_hip - right_hip
