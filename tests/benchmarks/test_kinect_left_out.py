@@ -194,12 +194,8 @@ SCALES = {
 """What each method makes of its input: it is so many times as large."""
 
 
-PEOPLE_OF = {False: tuple(f"s0{n}" for n in range(1, 9)), True: ("s01", "s05", "s08")}
-"""Whom the study is of, if it is not a quick check, and if it is."""
-
-
-def everybody(people: Sequence[str] = PEOPLE_OF[False]) -> list[Clip]:
-    return [clip(subject, take, "") for subject in people for take in range(2)]
+def everybody() -> list[Clip]:
+    return [clip(subject, take, "") for subject in kinect_vicon.SUBJECTS for take in range(2)]
 
 
 def stated(one: Clip) -> Stated:
@@ -208,12 +204,12 @@ def stated(one: Clip) -> Stated:
     return Stated(sigma, np.linspace(0, 1, shape[0]), np.arange(shape[0]) < 3)
 
 
-def left_out(scale: float, quick: bool = False) -> list[tuple[Scores, np.ndarray]]:
-    """Each person's scores and errors with the offset of a third of the others' clips, in a quick check of all."""
+def left_out(scale: float) -> list[tuple[Scores, np.ndarray]]:
+    """Each person's scores and errors with the offset of a third of the others' clips."""
     found = []
-    for who in PEOPLE_OF[quick]:
-        asked = [one for one in everybody(PEOPLE_OF[quick]) if one.subject == who]
-        others = [one for one in everybody(PEOPLE_OF[quick]) if one.subject != who][:: 1 if quick else 3]
+    for who in kinect_vicon.SUBJECTS:
+        asked = [one for one in everybody() if one.subject == who]
+        others = [one for one in everybody() if one.subject != who][::3]
         (known, seen), (wanted, own) = (
             ([one.centres for one in some], [scale * one.raw for one in some]) for some in (others, asked)
         )
@@ -223,7 +219,8 @@ def left_out(scale: float, quick: bool = False) -> list[tuple[Scores, np.ndarray
     return found
 
 
-def study(bench: Bench, monkeypatch: pytest.MonkeyPatch, quick: bool) -> Result:
+@pytest.fixture
+def result(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Result:
     """The study of everybody, with methods that learn nothing."""
     asked: list[tuple[Any, ...]] = []
 
@@ -237,33 +234,23 @@ def study(bench: Bench, monkeypatch: pytest.MonkeyPatch, quick: bool) -> Result:
 
     def read(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
         asked.append((path.name, tuple(subjects), every))
-        return everybody(subjects)
+        return everybody()
 
     monkeypatch.setattr(kinect_vicon, "read_clips", read)
     monkeypatch.setattr(Kinect, "tuned", lambda self, on: asked.append(tuple(one.name for one in on)) or {})
     monkeypatch.setattr(Kinect, "methods", methods)
-    found = kinect_vicon.run(replace(bench, quick=quick))
-    scored, taught, tuned = (66, 40, 1) if quick else (6, 3, 5)
-    people = PEOPLE_OF[quick]
-    names = tuple(one.name for one in everybody(people))
-    assert asked == [("ui_prmd.npz", people, scored), ("ui_prmd.npz", people, taught), names[::tuned]]
+    found, people = kinect_vicon.run(replace(bench, quick=False)), kinect_vicon.SUBJECTS
+    names = tuple(one.name for one in everybody())
+    assert asked == [("ui_prmd.npz", people, 6), ("ui_prmd.npz", people, 3), names[::5]]
     return found
 
 
-@pytest.fixture
-def result(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Result:
-    return study(bench, monkeypatch, quick=False)
-
-
-@pytest.mark.parametrize("quick", [False, True])
-def test_each_persons_offset_is_learned_on_the_others_and_who_is_out_of_step_is_in_no_mean(
-    quick: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result, people = study(bench, monkeypatch, quick), PEOPLE_OF[quick]
+def test_each_persons_offset_is_learned_on_the_others_and_who_is_out_of_step_is_in_no_mean(result: Result) -> None:
+    people = kinect_vicon.SUBJECTS
     records = {(record["method"], record["delay"]): record for record in result.data["records"]}
     assert records.keys() == SCALES.keys()
     for key, scale in SCALES.items():
-        scores, record = [found for found, _ in left_out(scale, quick)], records[key]
+        scores, record = [found for found, _ in left_out(scale)], records[key]
         for who, own in zip(people, scores, strict=True):
             assert record["people_mm"][who] == round(1e3 * own.position.mean(), 3)
             assert record["parameters"][who] == {"without": float(who[1:])}

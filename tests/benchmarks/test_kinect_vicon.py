@@ -1,7 +1,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity,
 from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.studies import kinect_clips, kinect_methods
 from steadypose.benchmarks.studies.kinect_clips import (
-    OTHER_SIDE,
     SCORED,
     Clip,
     align,
@@ -230,42 +229,3 @@ def test_every_nth_clip_of_each_person_is_read(monkeypatch) -> None:
     np.testing.assert_array_equal(one.kinect, pair.kinect)
     np.testing.assert_array_equal(one.raw[:, wrist], to_canonical(KINECT22, pair.kinect)[0][:, J["left_wrist"]])
     np.testing.assert_array_equal(one.centres[:, wrist], pair.vicon[:, J["left_wrist"]])
-
-
-@pytest.mark.parametrize(("quick", "steps"), [(True, 60), (False, 1000)])
-def test_regressions_learn_what_the_best_filter_of_their_delay_leaves(quick: bool, steps: int, monkeypatch) -> None:
-    called: list[tuple[Any, ...]] = []
-
-    def smoothed(clips: Sequence[np.ndarray], scored: Sequence[int], *given: Any) -> tuple[Any, ...]:
-        assert list(scored) == [J[name] for name in SCORED]
-        return ("smoothed", len(clips), *given)
-
-    def learn(*given: Any, **more: Any) -> Any:
-        called.append(given)
-        return lambda one: one
-
-    monkeypatch.setattr(kinect_methods.kinect_regression, "smoothed", smoothed)
-    monkeypatch.setattr(kinect_methods.kinect_regression, "ridge", learn)
-    monkeypatch.setattr(kinect_methods.kinect_regression, "temporal_convolution", learn)
-    clips = [clip(n, 12)._replace(subject=who, name=f"{n}") for n, who in enumerate(("s01", "s02", "s02"))]
-    bench = Bench(quick=quick, mocap=None, data=Path("nowhere.npz"), progress=Progress(disable=True))
-    bench.__dict__["smoothnets"] = []
-    kinect = Kinect(bench, Path("nowhere.npz"), clips, clips)
-    monkeypatch.setattr(Kinect, "correction", lambda self, who: Path(f"without-{who}"))
-    zero = dict.fromkeys(("s01 acceleration_mm", "s02 position_mm", "s02 acceleration_mm"), 0.0)
-    best = {
-        (KALMAN, d): Tuned({}, [{"density": x, "s01 position_mm": p, **zero} for x, p in ((9.0, 5.0), (1.0 + d, 1.0))])
-        for d in bench.delays
-    }
-    methods = list(kinect.methods("s02", best))
-    expected = []
-    for delay in bench.delays:
-        truths, ahead = [clips[0].centres], min(delay, 4)
-        expected.append((("smoothed", 1, delay, 0, 1.0 + delay), truths, 2200.0))
-        expected.append((("smoothed", 1, delay, ahead, 1.0 + delay), truths, OTHER_SIDE, ahead, steps))
-    assert called == expected
-    names = [KALMAN, "ridge regression", "temporal convolution", "steadypose", "steadypose, sensor known"]
-    found = sorted((method.name, method.delay) for method in methods)
-    assert found == sorted((name, delay) for name in names for delay in bench.delays)
-    answer = next(m for m in methods if (m.name, m.delay) == ("temporal convolution", bench.delays[-1])).run(clips[1:])
-    assert answer == (["smoothed", 2, bench.delays[-1], 4, 1.0 + bench.delays[-1]], None)
