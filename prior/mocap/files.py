@@ -7,6 +7,7 @@ and C3D, the format of motion capture systems, through ezc3d. A `Description` ad
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -184,10 +185,7 @@ def _trc(content: bytes, description: Description) -> _Read:
     names = names[: max(k + 1 for k, name in enumerate(names) if name)]
     cells = [row.split("\t") for row in rows[5:] if row.strip()]
     stated = header.get("NumFrames", "").strip()
-    if stated.isdigit() and len(cells) < int(stated):
-        raise MotionError(
-            f"expected {stated} frames, as its header says, got {len(cells)}; the file is cut short: export it again"
-        )
+    _refuse_cut(int(stated) if stated.isdigit() else 0, len(cells))
     width = 2 + 3 * len(names)
     values = np.array([[float(c) if c.strip() else np.nan for c in (row + [""] * width)[:width]] for row in cells])
     points = values[:, 2:].reshape(len(values), len(names), 3)
@@ -205,8 +203,23 @@ def _c3d(content: bytes, description: Description) -> _Read:
         point = (read := ezc3d.c3d(file.name))["parameters"]["POINT"]
     names = [str(name).rpartition(":")[2] for name in point["LABELS"]["value"]]
     points = read["data"]["points"][:3].transpose(2, 1, 0)[:, : len(names)].astype(np.float64)
+    _refuse_cut(_c3d_frames(content), len(points))
     units = (point["UNITS"]["value"] or ["mm"])[0]
     return _points(float(point["RATE"]["value"][0]), names, points, str(units), description)
+
+
+def _c3d_frames(content: bytes) -> int:
+    """Number of frames that a C3D's header states, 65535 at most; what ezc3d returns for it is what it found."""
+    big_endian = content[512 * (content[0] - 1) + 3] == 86
+    first, last = struct.unpack_from(">HH" if big_endian else "<HH", content, 6)
+    return last - first + 1
+
+
+def _refuse_cut(stated: int, frames: int) -> None:
+    if frames < stated:
+        raise MotionError(
+            f"expected {stated} frames, as its header says, got {frames}; the file is cut short: export it again"
+        )
 
 
 def _points(fps: float, names: Sequence[str], points: Floats, units: str, description: Description) -> _Read:

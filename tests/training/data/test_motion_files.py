@@ -81,9 +81,12 @@ def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
     assert np.isnan(body[:, J["spine1"]]).all()
 
 
-def test_a_trc_that_is_cut_short_is_refused() -> None:
-    with pytest.raises(MotionError, match="expected 4 frames, as its header says, got 3; the file is cut short"):
-        read_motion("take.trc", trc(points()).rpartition(b"\n")[0])
+def test_a_file_that_is_cut_short_is_refused(tmp_path: Path) -> None:
+    whole = c3d(tmp_path / "x.c3d", list(HALPE), 1000 * points(40))
+    cut = {"take.trc": trc(points(40)).rpartition(b"\n")[0], "take.c3d": whole[: len(whole) * 7 // 10]}
+    for name, content in cut.items():
+        with pytest.raises(MotionError, match=r"expected 40 frames, as its header says, got \d+; .* is cut short"):
+            read_motion(name, content)
 
 
 def test_a_c3d_is_of_joints_or_of_markers_on_the_skin(tmp_path: Path) -> None:
