@@ -6,6 +6,7 @@ finite are null. Stamps are capture times in seconds, because a JavaScript numbe
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -112,10 +113,11 @@ class WebNode(Node):
 
 def kept_token(file: Path) -> str:
     """The token in a file that only this user can read; created on first use."""
-    if file.exists() and (kept := file.read_text()):  # it is empty if the disk was full
-        return kept
-    with open(os.open(file, os.O_WRONLY | os.O_CREAT, 0o600), "w") as new:
-        new.write(token := secrets.token_urlsafe(24))
+    with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), "r+") as kept:
+        fcntl.flock(kept, fcntl.LOCK_EX)
+        token = kept.read()
+        if not token:  # it is new, or the disk was full
+            kept.write(token := secrets.token_urlsafe(24))
     return token
 
 

@@ -1,7 +1,9 @@
 import http.client
 import json
+import secrets
 import socket
 import stat
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -185,6 +187,23 @@ def test_a_token_that_found_no_room_on_the_disk_is_drawn_again(tmp_path: Path) -
     (tmp_path / "token").touch()
     assert len(token := kept_token(tmp_path / "token")) >= 32
     assert kept_token(tmp_path / "token") == token
+
+
+def test_nodes_that_start_at_once_draw_one_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tokens: list[str] = []
+    other = threading.Thread(target=lambda: tokens.append(kept_token(tmp_path / "token")))
+    draw = secrets.token_urlsafe
+
+    def while_another_starts(length: int) -> str:
+        if not other.ident:
+            other.start()
+            other.join(0.2)  # it waits for this token
+        return draw(length)
+
+    monkeypatch.setattr(secrets, "token_urlsafe", while_another_starts)
+    tokens.append(kept_token(tmp_path / "token"))
+    other.join()
+    assert len(set(tokens)) == 1
 
 
 def test_the_node_serves_what_the_others_publish(make_launch: Callable[..., Launch]) -> None:
