@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -66,6 +66,14 @@ class MotionClips:
             person=self.person[clips],
             data_set=self.data_set[clips],
         )
+
+
+def side_by_side(clips: Sequence[Floats]) -> Floats:
+    """Stack clips (T, J, 3) of different lengths into (T, C, J, 3), NaN after their ends."""
+    batch = np.full((max(map(len, clips)), len(clips), *clips[0].shape[1:]), np.nan)
+    for number, clip in enumerate(clips):
+        batch[: len(clip), number] = clip
+    return batch
 
 
 def prepared_clips(path: Path, split: str, frames: int, most: int) -> MotionClips:

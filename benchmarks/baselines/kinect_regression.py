@@ -16,6 +16,7 @@ from sklearn.linear_model import Ridge
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.kalman import fixed_lag
+from steadypose.benchmarks.motion import side_by_side
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
@@ -61,11 +62,8 @@ class Smoothed:
 
 def smoothed(clips: Sequence[Floats], scored: Sequence[int], delay: int, ahead: int, density: float) -> list[Smoothed]:
     """Smooth clips (T, 22, 3) of a Kinect's own joints for a regression of this delay that itself looks ``ahead``."""
-    longest = max(map(len, clips))
-    seen = np.full((longest, len(clips), *clips[0].shape[1:]), np.nan)
-    for number, clip in enumerate(clips):
-        seen[: len(clip), number] = clip
-    stamps = np.arange(longest) / FPS
+    seen = side_by_side(clips)
+    stamps = np.arange(len(seen)) / FPS
     late = fixed_lag(seen, stamps, delay, 2, density)
     early = late if ahead == 0 else fixed_lag(seen, stamps, delay - ahead, 2, density)
     result = []

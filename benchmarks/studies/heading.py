@@ -15,9 +15,9 @@ import numpy as np
 from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.roots import Baseline, baselines
 from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.motion import side_by_side
 from steadypose.benchmarks.provenance import ROOT, VARIANTS
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.studies.kinect_clips import side_by_side
 from steadypose.benchmarks.studies.rotations import AIMED, DELAY, METHODS, STEADYPOSE, matrices, pair
 from steadypose.benchmarks.studies.rotations_truth import angle, spread, tilt_between, wrapped
 from steadypose.msgs.types import PoseRaw, PoseWorld

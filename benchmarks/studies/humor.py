@@ -20,6 +20,7 @@ from torch import Tensor
 from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.banks import bank
 from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.corruption import below, gaussian, hide
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_set
 from steadypose.benchmarks.provenance import CLEAN_22, ROOT
 from steadypose.benchmarks.results import Result, Table
@@ -29,7 +30,6 @@ from steadypose.benchmarks.studies.humor_fits import (
     NOISE,
     Answer,
     camera_settings,
-    corrupted,
     fitted,
     load_labels,
     pictures,
@@ -193,8 +193,8 @@ def run(bench: Bench) -> Result:
     for name, model in bench.progress.track(models.items(), description="futures"):
         futures.append({"method": name, **predict(model, clips, samples)})
     clips = bench.clips(FRAMES, 2 if bench.quick else CLIPS)
-    noisy = _noisy(bench, clips, models, hide=False)
-    hidden = _noisy(bench, clips, models, hide=True)
+    noisy = _noisy(bench, clips, models, hidden=False)
+    hidden = _noisy(bench, clips, models, hidden=True)
     clips = bench.clips(FRAMES, 1 if bench.quick else PICTURES)
     detector = _pictures(bench, clips, models, depth=False)
     depth = _pictures(bench, clips, models, depth=True)
@@ -205,20 +205,21 @@ def run(bench: Bench) -> Result:
     )
 
 
-def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hide: bool) -> list[dict[str, Any]]:
-    """Make Table 2: all joints with noise; with ``hide``, without noise and joints below `HIDDEN_BELOW` hidden."""
+def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hidden: bool) -> list[dict[str, Any]]:
+    """Make Table 2: all joints with noise; with ``hidden``, without noise and joints below `HIDDEN_BELOW` hidden."""
     truth = clips.positions
-    seen = corrupted(truth, *((0.0, HIDDEN_BELOW) if hide else (NOISE, 0.0)), seed=0)
+    noise, lowest = (0.0, HIDDEN_BELOW) if hidden else (NOISE, 0.0)
+    seen = hide(gaussian(truth, noise, np.random.default_rng(0)), below(truth, lowest))
     live = {delay: _live(clips, seen, delay) for delay in (4, DELAY)}
     answers: dict[str, list[Answer]] = {
         _TRUTH: _each(truth),
         "filter bank, offline": _each(bank(seen, clips.stamps_s, FRAMES)),
     }
-    if not hide:
+    if not hidden:
         answers = {_TRUTH: _each(truth), _RAW: _each(seen)} | answers
     answers |= {f"steadypose live, delay {delay}": _each(found.positions[-FRAMES:]) for delay, found in live.items()}
     names = (_PER_FRAME, *reversed([*VARIANTS]), SHIPS)
-    for name in bench.progress.track(names, description="hidden" if hide else "noisy"):
+    for name in bench.progress.track(names, description="hidden" if hidden else "noisy"):
         answers[name] = _fits(models, name, live[DELAY], seen)
     load, unseen = load_labels(clips), np.isnan(seen[..., 0])
     return [{"method": name, **scores(found, truth, unseen, load)} for name, found in answers.items()]

@@ -186,10 +186,3 @@ def _mm(values: Floats) -> float | None:
 def shipped() -> HumorNet:
     """Return the default weights."""
     return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")
-
-
-def corrupted(truth: Floats, noise: float, below: float, seed: int) -> Floats:
-    """Add noise to (T, C, 22, 3), metres, and hide joints whose truth is lower than ``below``, metres."""
-    seen = truth + noise * np.random.default_rng(seed).standard_normal(truth.shape)
-    seen[truth[..., 2] < below] = np.nan
-    return seen

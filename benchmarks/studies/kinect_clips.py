@@ -68,14 +68,6 @@ def _clip(pair: KinectPair) -> Clip:
     return Clip(pair.name, pair.subject, pair.kinect, raw, pair.vicon[:, scored])
 
 
-def side_by_side(clips: Sequence[Floats]) -> Floats:
-    """Stack clips (T, J, 3) of different lengths into (T, C, J, 3), NaN after their ends."""
-    batch = np.full((max(map(len, clips)), len(clips), *clips[0].shape[1:]), np.nan)
-    for number, clip in enumerate(clips):
-        batch[: len(clip), number] = clip
-    return batch
-
-
 OFF = 0.10
 """Error that the predicted standard deviation should indicate, metres."""
 WORST = 0.1

@@ -16,9 +16,9 @@ from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines import kinect_regression, smoothnet
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Bench, Tuned, loss, tune
-from steadypose.benchmarks.motion import digest
+from steadypose.benchmarks.motion import digest, side_by_side
 from steadypose.benchmarks.provenance import ROOT
-from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, quick_score, side_by_side
+from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED, Clip, quick_score
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
