@@ -83,7 +83,7 @@ def draw(history: History, body: int | None = None) -> Figure:
         ax.grid(alpha=0.25)
         ax.tick_params(labelbottom=row == len(panels) - 1)
         if row == len(panels) - 1:
-            ax.set_xlabel("seconds of capture")
+            ax.set_xlabel("time, s")
     beside = columns[1].subgridspec(3, 1, height_ratios=[2, 2, 1.2])
     draw_path(figure.add_subplot(beside[0]), history, chosen)
     draw_by_joint(figure.add_subplot(beside[1]), history.track(POSE_CLEAN, chosen), errors)
@@ -118,11 +118,11 @@ def draw_completion(completion: Completion, title: str) -> Figure:
         cmap=ListedColormap(["white", _GIVEN, _COMPLETED]), extent=(0.0, len(shown) / FPS, 21.5, -0.5),
     )  # fmt: skip
     which.set_yticks(range(len(JOINTS)), JOINTS, fontsize=7)
-    which.set(title="which joints were given when", xlabel="seconds")
+    which.set(title="given and completed joints", xlabel="time, s")
     above = figure.add_subplot(grid[1, 1])
     for mask, colour in ((known[:, 0], _GIVEN), (~known[:, 0], _COMPLETED)):
         above.plot(joints[mask, 0, 0], joints[mask, 0, 1], ".", color=colour, markersize=3)
-    above.set(title="the pelvis from above, m", aspect="equal")
+    above.set(title="pelvis from above, world, m", xlabel="x", ylabel="y", aspect="equal")
     above.grid(alpha=0.25)
     return figure
 
@@ -132,6 +132,7 @@ def draw_misfit(fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit
 
     Each of ``fits`` has a body's id, stamps (T,) in nanoseconds, and distances (T, 22); its fourth entry is not used.
     """
+    from matplotlib.colors import PowerNorm
     from matplotlib.figure import Figure
 
     shown = fits[:6]
@@ -139,9 +140,11 @@ def draw_misfit(fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit
     for axis, (body, stamps, misfit, _) in zip(figure.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
         seconds = (stamps[[0, -1]] - fits[0][1][0]) * 1e-9
         image = axis.imshow(
-            misfit.T, aspect="auto", interpolation="nearest", extent=(*seconds, len(JOINTS) - 0.5, -0.5), cmap="magma"
-        )
-        axis.set_yticks(range(len(JOINTS)), JOINTS, fontsize=5)
-        axis.set(title=f"body {body}: how far joints lie from where they were seen, {unit}", xlabel="seconds")
-        figure.colorbar(image, ax=axis)
+            misfit.T, aspect="auto", interpolation="nearest", extent=(*seconds, len(JOINTS) - 0.5, -0.5), cmap="magma",
+            norm=PowerNorm(0.5, vmin=0.0),  # an outlier must not hide the other residuals
+        )  # fmt: skip
+        axis.set_yticks(range(len(JOINTS)), JOINTS, fontsize=6)
+        axis.set(title=f"body {body}: distance between fitted and observed joints (white: not observed)")
+        axis.set_xlabel("time, s")
+        figure.colorbar(image, ax=axis, label=f"distance, {unit}")
     return figure

@@ -64,6 +64,7 @@ class History:
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
     """(22,) whether the sensor's layout has each joint"""
     origin: str = ""
+    """sources and skeletons, for the title"""
     sensor: dict[str, list[float]] = field(default_factory=dict)
     """sensor noise estimated by the prior, each second: ``jitter_mm`` and ``slow_error_mm``"""
     dropped_or_refused: Counter[str] = field(default_factory=Counter)
@@ -143,7 +144,8 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
     if observable.any():
         history.observable = observable
     history.reported = bool(dropped_or_refused)
-    history.origin = " · ".join([", ".join(sources), *skeletons])
+    names = {"source": sources, "skeleton": skeletons}
+    history.origin = " · ".join(f"{what} {', '.join(found)}" for what, found in names.items() if found)
     for node, values in dropped_or_refused.items():
         counts = {key: value for key, value in values.items() if key.startswith(("dropped.", "refused."))}
         history.dropped_or_refused.update(

@@ -57,27 +57,27 @@ def panels_over_time(history: History, body: int, errors: dict[str, TrackError])
     if clean is not None:
         for joint in busiest_joints(clean):
             panels.append(
-                Panel(f"{JOINTS[joint]} from the pelvis, m", 1.25, lambda ax, j=joint: _draw_joint(ax, clean, j))
+                Panel(f"{JOINTS[joint]} relative to the pelvis, m", 1.25, lambda ax, j=joint: _draw_joint(ax, clean, j))
             )
-        panels.append(Panel("where each joint comes from", 3.0, lambda ax: _draw_states(ax, clean)))
+        panels.append(Panel("state of each joint", 3.0, lambda ax: _draw_states(ax, clean)))
         panels.append(Panel("standard deviation, cm", 0.8, lambda ax: _draw_sigma(ax, clean)))
         if np.isfinite(clean.anomaly).any():
             panels.append(Panel("anomaly score", 0.8, lambda ax: _draw_anomaly(ax, clean)))
     elif raw is not None:
         for joint in (J["left_wrist"], J["right_wrist"], J["left_ankle"]):
             panels.append(Panel(f"{JOINTS[joint]}, world, m", 1.25, lambda ax, j=joint: _draw_raw_joint(ax, raw, j)))
-        panels.append(Panel("joints the sensor gave", 3.0, lambda ax: _draw_observed(ax, raw, history.observable)))
+        panels.append(Panel("observed joints", 3.0, lambda ax: _draw_observed(ax, raw, history.observable)))
     if world is not None:
         panels.append(Panel("contacts", 1.0, lambda ax: draw_contacts(ax, world)))
     if errors:
         panels.append(
             Panel(
-                "distance of a joint from the truth, cm (mean of those given)",
+                "position error, cm, mean over joints",
                 1.25,
                 lambda ax: _draw_errors(ax, errors),
             )
         )
-    panels.append(Panel("from frame to frame, ms", 1.0, lambda ax: _draw_intervals(ax, history)))
+    panels.append(Panel("interval between frames, ms", 1.0, lambda ax: _draw_intervals(ax, history)))
     return panels
 
 
@@ -107,7 +107,8 @@ def _draw_joint(ax: Axes, clean: Track, joint: int) -> None:
     pelvis = clean.positions[:, :1]
     time, before, after = with_gaps(clean.time, (clean.raw - pelvis)[:, joint], (clean.positions - pelvis)[:, joint])
     for axis, (name, colour) in enumerate(AXIS_COLOURS.items()):
-        ax.plot(time, before[:, axis], ".", color=colour, markersize=2.5, alpha=0.35, label=f"{name} raw")
+        if np.isfinite(before).any():
+            ax.plot(time, before[:, axis], ".", color=colour, markersize=2.5, alpha=0.35, label=f"{name} raw")
         ax.plot(time, after[:, axis], color=colour, linewidth=1.3, label=f"{name} clean")
     ax.legend(loc="upper right", ncols=6, fontsize=7, markerscale=3, handlelength=1.2)
     low, high = np.nanmin(after), np.nanmax(after)
@@ -127,7 +128,7 @@ def _draw_states(ax: Axes, clean: Track) -> None:
 
 def _draw_observed(ax: Axes, raw: Track, observable: NDArray[np.bool_]) -> None:
     seen = np.isfinite(raw.positions[:, observable, 0])
-    colours = {"missing": STATE_COLOURS[JointState.UNKNOWN], "given": STATE_COLOURS[JointState.SEEN]}
+    colours = {"missing": STATE_COLOURS[JointState.UNKNOWN], "observed": STATE_COLOURS[JointState.SEEN]}
     _draw_cells(ax, raw.time, seen.astype(np.uint8), colours)
     names = [JOINTS[joint] for joint in np.flatnonzero(observable)]
     ax.set_yticks(range(len(names)), names, fontsize=6)
@@ -211,8 +212,8 @@ def _draw_intervals(ax: Axes, history: History) -> None:
     ax.minorticks_off()
 
 
-LATE_RATIO = 1.5
-"""Interval between frames, relative to the median, above which a frame counts as late, ratio."""
+GAP_RATIO = 1.5
+"""Interval between frames, relative to the median, above which it counts as a gap, ratio."""
 FIGURES = 12
 CONTACT_PROBABILITY = 0.5
 
@@ -220,10 +221,20 @@ CONTACT_PROBABILITY = 0.5
 def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
     """Draw stick figures at regular times, seen from the front, with the input behind the output; bones to joints that
     the sensor lacks are faint."""
+    from matplotlib.lines import Line2D
+
     clean = history.track(POSE_CLEAN, body)
-    track = next(
-        t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if (t := history.track(topic, body)) is not None
+    topic, track = next(
+        (topic, t)
+        for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH)
+        if (t := history.track(topic, body)) is not None
     )
+    lines = {topic.removeprefix("pose/"): RAW_COLOUR}
+    if clean is not None:
+        lines = {"raw": RAW_COLOUR} if np.isfinite(clean.raw).any() else {}
+        lines |= {f"clean: {state.name.lower()}": STATE_COLOURS[state] for state in JointState if state in clean.state}
+    handles = [Line2D([], [], color=colour, lw=3, label=label) for label, colour in lines.items()]
+    ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(0, 1.12), ncols=5, fontsize=8, frameon=False)
     raw_bones = bones(history.observable)
     opacity = np.where(history.observable[ALL_BONES].all(axis=1), 1.0, FAINT)
     chosen = np.linspace(0, len(track.time) - 1, min(FIGURES, len(track.time))).round().astype(int)
@@ -257,8 +268,8 @@ def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> 
     pelvis = np.where(np.isfinite(pelvis).all(axis=-1, keepdims=True), pelvis, nan_mean(joints, axis=1)[:, None])
     places = np.arange(len(joints))
     for place, second in enumerate(seconds):
-        ax.text(place, -1.13, f"{second:.1f} s", ha="center", fontsize=8)
-    ax.set(aspect="equal", xlim=(-0.6, max(FIGURES, len(joints)) - 0.4), ylim=(-1.2, 0.85))
+        ax.text(place, -1.27, f"{second:.1f} s", ha="center", fontsize=8)
+    ax.set(aspect="equal", xlim=(-0.6, max(FIGURES, len(joints)) - 0.4), ylim=(-1.34, 0.85))
     ax.axis("off")
     centred = [points - pelvis for points in (joints, *others)]
     places = np.arange(len(joints))[:, None]
@@ -285,29 +296,31 @@ def draw_bones(
 
 def draw_path(ax: Axes, history: History, body: int) -> None:
     """Draw the paths over the floor from above, with the places where feet stood."""
-    ax.set_title("from above, m", loc="left", fontsize=10, weight="bold")
+    ax.set_title("pelvis from above, world, m", loc="left", fontsize=10, weight="bold")
+    ax.set(xlabel="x", ylabel="y")
     topic = next(t for t in (POSE_WORLD, POSE_CLEAN, POSE_RAW, POSE_TRUTH) if t in history.tracks)
-    for person in history.tracks.get(POSE_TRUTH, {}).values():
+    for number, person in enumerate(history.tracks.get(POSE_TRUTH, {}).values() if topic != POSE_TRUTH else ()):
         _, trail = with_gaps(person.time, person.positions[:, 0, :2])
-        ax.plot(*trail.T, color=TRUTH_COLOUR, linewidth=3, alpha=0.35)
+        ax.plot(*trail.T, color=TRUTH_COLOUR, linewidth=3, alpha=0.35, label=None if number else "ground truth")
     for other, track in history.tracks[topic].items():
         pelvis = track.positions[:, 0, :2]
         _, trail = with_gaps(track.time, pelvis)
-        ax.plot(*trail.T, color=WORLD_COLOUR if other == body else RAW_COLOUR, linewidth=1.5)
+        colour, label = (WORLD_COLOUR, topic.removeprefix("pose/")) if other == body else (RAW_COLOUR, None)
+        ax.plot(*trail.T, color=colour, linewidth=1.5, label=label)
         seen = np.flatnonzero(np.isfinite(pelvis[:, 0]))
         if len(seen):
             ax.annotate(f"{other}", tuple(pelvis[seen[0]]), fontsize=8, textcoords="offset points", xytext=(4, 4))
-            ax.plot(*pelvis[seen[0]], "o", color="black", markersize=4)
+            ax.plot(*pelvis[seen[0]], "o", color="black", markersize=4, label="start" if other == body else None)
     world = history.track(POSE_WORLD, body)
     if world is not None:
         for side, colour in (("left", AXIS_COLOURS["y"]), ("right", AXIS_COLOURS["x"])):
             places = [row for row, name in enumerate(CONTACTS) if name in (f"{side}_ankle", f"{side}_foot")]
             touching = world.contacts[:, places] > CONTACT_PROBABILITY
             spots = world.positions[:, CONTACT_INDICES[places], :2][touching]
-            ax.plot(*spots.T, ".", color=colour, markersize=3, alpha=0.5, label=f"{side} foot down", zorder=0)
-    handles, _ = ax.get_legend_handles_labels()
-    if handles:
-        ax.legend(loc="best", fontsize=7, markerscale=3)
+            if len(spots):
+                ax.plot(*spots.T, "s", color=colour, markersize=1.5, alpha=0.5, label=f"{side} foot down", zorder=0)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="best", fontsize=7)
     ax.set_aspect("equal", adjustable="datalim")
     ax.grid(alpha=0.25)
 
@@ -315,10 +328,10 @@ def draw_path(ax: Axes, history: History, body: int) -> None:
 def draw_by_joint(ax: Axes, clean: Track | None, errors: dict[str, TrackError]) -> None:
     """Draw each joint's mean distance from the ground truth or, without ground truth, its mean correction."""
     if errors:
-        title = "by joint: mean distance from the truth, cm"
+        title = "mean position error of each joint, cm"
         bars = {topic.removeprefix("pose/"): (error.by_joint, TOPIC_COLOURS[topic]) for topic, error in errors.items()}
-    elif clean is not None and np.isfinite(corrections(clean)).any():
-        title = "by joint: mean correction, cm"
+    elif clean is not None and np.nan_to_num(corrections(clean)).any():
+        title = "mean distance between raw and clean, cm"
         bars = {"correction": (nan_mean(corrections(clean), axis=0), CLEAN_COLOUR)}
     else:
         ax.axis("off")
@@ -341,22 +354,22 @@ def draw_summary(ax: Axes, history: History, body: int, errors: dict[str, TrackE
         if len(stamps) > 1:
             steps = np.diff(stamps)
             usual = np.median(steps)
-            late = int((steps > LATE_RATIO * usual).sum())
+            gaps = int((steps > GAP_RATIO * usual).sum())
             rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if stamps[-1] > stamps[0] else np.nan
             longest = f"longest {steps.max() * 1e3:.0f} ms"
-            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz {late:>3} late, {longest}")
+            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz {gaps:>3} gaps, {longest}")
     clean = history.track(POSE_CLEAN, body)
     if clean is not None:
         shares = [f"{state.name.lower()} {(clean.state == state).mean():.1%}" for state in JointState]
         lines += ["", f"joints of body {body}:", "  " + "  ".join(shares)]
-    for key, name in (("jitter_mm", "from frame to frame"), ("slow_error_mm", "slow")):
+    for key, name in (("jitter_mm", "independent"), ("slow_error_mm", "time-correlated")):
         if found := history.sensor.get(key):
-            lines.append(f"sensor's error, {name}: {np.median(found):.1f} mm along an axis")
+            lines.append(f"sensor noise, {name}: {np.median(found):.1f} mm along an axis")
     for topic, error in errors.items():
         mean, p95 = 100 * error.mean.mean(), 100 * np.percentile(error.mean, 95)
         lines.append(f"error {topic:<10} mean {mean:5.1f}  p95 {p95:5.1f} cm")
     if errors and not history.calibrated:
-        lines.append("(the camera's place is unknown: moved to where it fits best)")
+        lines.append("(camera not calibrated: aligned to the truth first)")
     silence = "nothing dropped or refused" if history.reported else "no diagnostics were recorded"
     lines += ["", "dropped and refused:" if history.dropped_or_refused else silence]
     lines += [f"  {count:>6}  {cause}" for cause, count in history.dropped_or_refused.most_common(14)]

@@ -129,11 +129,13 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
         middle = (sum(widths[:number]) + widths[number] / 2) / sum(widths)
         figure.text(middle, 0.985, title, ha="center", va="top", fontsize=11, weight="bold")
     canvas = FigureCanvasAgg(figure)
+    states = clean is not None or world is not None
+    faint = Line2D([], [], color=MIDDLE_COLOUR, lw=3, alpha=FAINT, label="faint: not observed")
     figure.legend(
         handles=[
             Line2D([], [], color=LEFT_COLOUR, lw=3, label="left"),
             Line2D([], [], color=RIGHT_COLOUR, lw=3, label="right"),
-            Line2D([], [], color=MIDDLE_COLOUR, lw=3, alpha=FAINT, label="faint: not observed"),
+            *([faint] if states else []),
             *([Line2D([], [], color=CONTACT_COLOUR, marker="o", lw=0, label="contact")] if world is not None else []),
         ],
         loc="lower center", ncols=4, frameon=False, fontsize=9, borderaxespad=0.1,

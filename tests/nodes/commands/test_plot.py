@@ -1,6 +1,6 @@
 import dataclasses
 import errno
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.small import plot
 from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.sinks.plot import video as video_of
 from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path
 from steadypose.nodes.sinks.plot.panels import busiest_joints, draw_contacts
@@ -184,6 +185,46 @@ def test_a_full_disk_is_said_and_the_picture_that_was_there_stays(tmp_path: Path
 def test_the_title_tells_an_id_from_a_count(tmp_path: Path) -> None:
     history = history_of_path(record(tmp_path / "bag", 0.5, bodies=2))
     assert draw(history, 1).get_suptitle().endswith("body 1, one of 2")
+
+
+def labels(figure: Figure, title: str) -> list[str]:
+    """The legend of the first panel with this title; the stick figures come first, without one."""
+    ax = next(ax for ax in figure.axes if ax.get_title("left") == title)
+    legend = ax.get_legend()
+    return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+def test_every_line_has_a_label_and_no_label_is_without_a_line(tmp_path: Path) -> None:
+    def hide(_: str, message: Message) -> None:
+        if isinstance(message, PoseClean):
+            message.bodies[0].raw_positions[:] = np.nan
+        if isinstance(message, PoseWorld):
+            message.bodies[0].contacts[:] = np.nan
+
+    whole = draw(history_of_path(record(tmp_path / "whole", 1.0)))
+    bare = draw(history_of_path(record(tmp_path / "bare", 1.0, {POSE_CLEAN, POSE_WORLD}, hide)))
+    path, joint = "pelvis from above, world, m", "left_wrist relative to the pelvis, m"
+    assert labels(whole, path)[:3] == ["ground truth", "world", "start"]
+    assert "raw" in labels(whole, ""), "the stick figures"
+    assert labels(whole, joint)[:2] == ["x raw", "x clean"]
+    assert labels(bare, path) == ["world", "start"]
+    assert "raw" not in labels(bare, "")
+    assert labels(bare, joint) == ["x clean", "y clean", "z clean"]
+
+
+def test_the_legend_of_a_video_without_states_fits_it(tmp_path: Path, monkeypatch) -> None:
+    wide: list[bool] = []
+    save = video_of._write_gif
+
+    def measure(frames: Iterator[np.ndarray], path: Path, fps: float) -> int:
+        images = list(frames)
+        wide.extend(bool((image[-24:, [0, -1]] < 250).any()) for image in images)
+        return save(iter(images), path, fps)
+
+    monkeypatch.setattr(video_of, "_write_gif", measure)
+    plot(record(tmp_path / "bag", 0.3, {POSE_RAW}), video=tmp_path / "raw.gif")
+    assert wide == [False] * len(wide)
+    assert wide
 
 
 def test_what_is_not_one_recording_says_what_to_draw(tmp_path: Path) -> None:

@@ -80,8 +80,8 @@ def test_it_is_drawn(cleaned: Path, name: str, tmp_path: Path) -> None:
 def test_arrays_without_what_was_observed_show_no_corrections(cleaned: Path) -> None:
     shown = {name: [ax.get_title("left") for ax in draw(history_of_path(cleaned / name)).axes if ax.axison]
              for name in ("walk", "walk.npz")}  # fmt: skip
-    assert "by joint: mean correction, cm" in shown["walk"]
-    assert "by joint: mean correction, cm" not in shown["walk.npz"]
+    assert "mean distance between raw and clean, cm" in shown["walk"]
+    assert "mean distance between raw and clean, cm" not in shown["walk.npz"]
 
 
 def test_info_says_what_is_in_it(cleaned: Path, capsys) -> None:
