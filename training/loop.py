@@ -6,9 +6,9 @@ Training is resumable, shows a progress bar, draws curves as it runs, and writes
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +24,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.distributed import average_gradients, from_first, processes, rank, share, writes
+from steadypose.training.files import whole
 from steadypose.training.weights import save_weights, started
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -268,10 +269,11 @@ class TrainingRun:
         return "  ".join(f"{k} {v:.4g}" for k, v in (self.curves[-1] if self.curves else {}).items() if k != "step")
 
     def _save(self) -> None:
-        part = self._checkpoint.with_suffix(".part")
-        torch.save(self._states(), part)
-        os.replace(part, self._checkpoint)
-        (self.directory / "curves.json").write_text(json.dumps(self.curves, indent=1))
+        torch.save(self._states(), states := io.BytesIO())  # in a file, it reports a full disk as an internal failure
+        with whole(self._checkpoint) as file:
+            file.write(states.getbuffer())
+        with whole(self.directory / "curves.json") as file:
+            file.write(json.dumps(self.curves, indent=1).encode())
         draw_curves(self.curves, self.directory / "curves.png")
 
     def _states(self) -> dict[str, Any]:
@@ -293,4 +295,5 @@ def draw_curves(curves: list[dict[str, float]], path: Path) -> None:
         axis.grid(alpha=0.3)
         if min(c[name] for c in curves) > 0:
             axis.set_yscale("log")
-    figure.savefig(path, dpi=110)
+    with whole(path) as file:
+        figure.savefig(file, dpi=110)

@@ -17,6 +17,7 @@ from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models import weights as weights_io
 from steadypose.prior.models.weights import Arrays, WeightsError
 from steadypose.training.distributed import writes
+from steadypose.training.files import whole
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:
@@ -29,15 +30,17 @@ def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: 
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in model.state_dict().items()}
-    _write_whole(path, save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
+    with whole(path) as file:
+        file.write(save(tensors, metadata={"config": json.dumps(dict(config), sort_keys=True)}))
     write_card(path, card)
 
 
 def write_card(path: Path, card: Mapping[str, Any]) -> None:
     """Write the card (heading to content) of the weights ``path`` beside them, with commit and machine."""
-    whole = {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}
-    lines = [f"# {path.stem}", "", *(f"- **{heading}**: {content}" for heading, content in whole.items()), ""]
-    _write_whole(path.with_suffix(".md"), "\n".join(lines).encode())
+    entries = {**card, "Commit": _commit(), "Made on": f"{platform.machine()}, torch on CPU"}
+    lines = [f"# {path.stem}", "", *(f"- **{heading}**: {content}" for heading, content in entries.items()), ""]
+    with whole(path.with_suffix(".md")) as file:
+        file.write("\n".join(lines).encode())
 
 
 def install(path: Path) -> Path:
@@ -51,7 +54,8 @@ def install(path: Path) -> Path:
     for old in _belonging(folder / path.name):
         os.replace(old, folder / "previous" / old.name)
     for new in _belonging(path):
-        _write_whole(folder / new.name, new.read_bytes())
+        with whole(folder / new.name) as file:
+            file.write(new.read_bytes())
     return folder / path.name
 
 
@@ -79,12 +83,6 @@ def started(model: nn.Module, name: str, start: str | None) -> str:
 def _belonging(path: Path) -> list[Path]:
     """Return the files of these weights: weights, card, curves, and others with their name."""
     return [file for file in path.parent.glob(f"{path.stem}.*") if file.is_file()]
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(content)
-    os.replace(part, path)
 
 
 def _commit() -> str:

@@ -20,6 +20,7 @@ from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.training.data.datasets import Split, Use
 from steadypose.training.data.readers import Dropped
+from steadypose.training.files import whole
 
 FPS = 30.0
 """Frame rate of all training data, frames per second."""
@@ -263,9 +264,8 @@ _TEXTS = ("name", "source", "licence", "subject", "action")
 
 def save_arrays(path: Path, **arrays: NDArray[Any]) -> None:
     """Write an ``.npz`` atomically."""
-    part = path.with_suffix(".part.npz")
-    np.savez(part, **arrays)  # type: ignore[arg-type]
-    part.replace(path)
+    with whole(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def made_once(path: Path, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
