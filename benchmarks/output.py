@@ -75,7 +75,7 @@ def _completed(path: Path) -> np.ndarray:
     raws = [message for _, message in islice(open_recording(path), FRAMES) if isinstance(message, PoseRaw)]
     del raws[40:70]
     completer = LiveCompleter.load("default")
-    uncertainty = Uncertainty(completer.config.never_sigma, 1, LivePosture.load("default"))
+    uncertainty = Uncertainty(completer.config.far_sigma, 1, LivePosture.load("default"))
     done = complete_raws(path.name, raws, PartsCompleter(completer), uncertainty).done
     return np.concatenate([np.ravel(completed.positions[np.isfinite(completed.positions)]) for _, completed in done])
 

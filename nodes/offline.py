@@ -68,7 +68,7 @@ def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
     """Load the completer of a weight set, and its output's uncertainty."""
     completer = LiveCompleter.load(weights)
     config, posture = completer.config, LivePosture.load(weights)
-    return PartsCompleter(completer), Uncertainty(config.never_sigma, config.half_frames, posture)
+    return PartsCompleter(completer), Uncertainty(config.far_sigma, config.half_frames, posture)
 
 
 def complete_source(

@@ -20,7 +20,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.inverse_kinematics import HELD, fit_lengths, place_joints, solve_rotations
 from steadypose.prior.body.mixtures import mix
 from steadypose.prior.body.skeleton import HIPS, PARENTS, J, finite_joints, limbs
-from steadypose.prior.models.completer_features import rotations_of_6d
+from steadypose.prior.models.completer_features import growth, rotations_of_6d
 from steadypose.prior.models.line import draw_line
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.posture import LivePosture
@@ -149,7 +149,7 @@ class Uncertainty:
     far: Sequence[float]
     """(22,) metres along an axis, standard deviation of each joint far from the frames in which it is known"""
     half: float
-    """frames from a joint's nearest known frame at which its standard deviation is half of that"""
+    """frames from a joint's last known frame at which its standard deviation is half of that, if none follows"""
     posture: LivePosture
     """Gaussian of postures, for joints that are known in no frame"""
 
@@ -159,24 +159,25 @@ class Uncertainty:
         The noise of given joints is estimated from their second differences.
         """
         known = finite_joints(given)
-        apart = frames_apart(known)
+        since, until = frames_since_and_until(known)
+        with np.errstate(divide="ignore"):
+            # as in the variance of a Brownian bridge, which is s u / (s + u)
+            between = 1.0 / (1.0 / since + 1.0 / until)
+            grown = growth(between, self.half)
         bends = np.linalg.norm(np.diff(given, n=2, axis=0), axis=-1)
         noise = np.full(22, MIN_SIGMA)
         for joint in np.flatnonzero(np.isfinite(bends).any(axis=0)):
             # 1.538 is the median length of a standard normal vector; a second difference has six times the variance
             noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), MIN_SIGMA)
-        grown = 1.0 - self.half / (apart + self.half)
         ever: Bools = np.asarray(known.any(axis=0))
         never = self.posture.sigma_given(ever)
         never[_HEAD] = np.maximum(never[_HEAD], np.take(self.far, _HEAD))  # people hold it differently
         if not ever[_LOWER].any():
             never[_WAIST] = np.maximum(never[_WAIST], UNSEEN_WAIST)
         guessed = np.hypot(np.maximum(np.where(ever, self.far, never), MIN_NEVER) * grown, noise)
-        since, until = frames_since_and_until(known[:, :1])
+        since, until, between = since[:, :1], until[:, :1], between[:, :1]
         rootless = np.minimum(since, until) * np.minimum((since + until) / LONG, 1.0)
         drift = np.minimum(DRIFT * np.where(np.isfinite(rootless), rootless, 0.0), MAX_DRIFT)
-        with np.errstate(divide="ignore"):
-            between = 1.0 / (1.0 / since + 1.0 / until)
         drift = np.maximum(drift, WANDER * np.where(np.isfinite(between), between, 0.0) ** 1.5)
         guessed = np.hypot(guessed, drift)
         return np.where(known, noise, guessed)

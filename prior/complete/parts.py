@@ -20,7 +20,7 @@ from steadypose.prior.models.hgvae.live_completion import LiveCompletion
 from steadypose.prior.models.line import draw_line
 from steadypose.prior.models.weights import WeightsError, load_weights, part
 
-SHARE = 0.8
+SHARE = 0.65
 """Share of HG-VAE's completion in the blend where a joint is hidden from the start, to the end or throughout. Between
 observations it is proportional to the gap, for the completer is better in short ones (chosen on validation,
 benchmarks/NOTEBOOK.md)."""

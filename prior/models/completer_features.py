@@ -21,6 +21,7 @@ from steadypose.prior.body.kinematics import from_rotation_vectors, heading, qua
 from steadypose.prior.body.skeleton import CHILDREN, HIPS, PARENTS, J, finite_joints, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.line import Line, draw_line, lerp, write_slerp, write_splines
+from steadypose.prior.models.weights import WeightsError
 from steadypose.prior.timing.rate import FPS
 
 JOINTS = 22
@@ -58,23 +59,27 @@ _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
 class CompleterConfig:
     """The sizes of the completer."""
 
-    width: int = 128
+    width: int = 160
     """width of the transformer's tokens, one per frame"""
     heads: int = 8
     """number of attention heads of each layer"""
-    layers: int = 5
+    layers: int = 6
     """number of layers"""
     reach: int = 64
     """frames at which relative positions are clipped"""
-    never_sigma: tuple[float, ...] = (0.1,) * JOINTS
-    """(22,) metres along an axis, error of each joint if it is never known (validation people)"""
+    far_sigma: tuple[float, ...] = (0.1,) * JOINTS
+    """(22,) metres along an axis, error of each joint far from the frames in which it is known (validation people)"""
     half_frames: float = 10.0
-    """frames from a joint's nearest known frame at which its error is half of `never_sigma`"""
+    """frames from a joint's last known frame at which its error is half of `far_sigma`, if none follows"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> CompleterConfig:
-        """Build the configuration from the JSON of a weights file."""
-        return cls(**{**config, "never_sigma": tuple(config["never_sigma"])})
+        """Build the configuration from the JSON of a weights file; raises WeightsError for an earlier version's."""
+        if "far_sigma" not in config:
+            raise WeightsError(
+                "completer: expected weights of this version, which states errors otherwise: train again"
+            )
+        return cls(**{**config, "far_sigma": tuple(config["far_sigma"])})
 
 
 class Window(NamedTuple):
@@ -200,12 +205,19 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
     return Window(features, matrices, path, bend, line, turn, origin)
 
 
-def correction_share(line: Line) -> Floats32:
-    """(B, T, K, 1) share of what a network adds to the cubic: that of `SHARE_FRAMES`, and 1 if a track is known on one
-    side only or never.
+def correction_share(line: Line, whole: float = SHARE_FRAMES) -> Floats32:
+    """(B, T, K, 1) share of what a network adds to the cubic: proportional to the gap up to ``whole`` frames, and 1 if
+    a track is known on one side only or never.
     """
     length = (line.after - line.before)[..., None]
-    return np.where(length > 0, np.minimum(length / SHARE_FRAMES, 1.0), 1.0).astype(np.float32)
+    return np.where(length > 0, np.minimum(length / whole, 1.0), 1.0).astype(np.float32)
+
+
+def growth(between: Floats, half: float) -> Floats:
+    """Return the share of a joint's error far from its known frames at ``between`` (see `Uncertainty.of`) frames, one
+    half at ``half`` frames. It is quadratic at first, because positions and velocities are known at the ends.
+    """
+    return 1.0 / (1.0 + np.square(half / between))
 
 
 def rotations_of_6d(x: NDArray[Float]) -> NDArray[Float]:

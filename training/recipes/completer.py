@@ -24,17 +24,23 @@ from torch.nn import functional as F
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.skeleton import J, limbs
+from steadypose.prior.complete.body import complete
+from steadypose.prior.complete.parts import PartsCompleter
 from steadypose.prior.fit.tensors import forward_kinematics, from_6d, to_6d
+from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import (
     BENDS,
     FEATURES,
     OUTPUTS,
+    SHARE_FRAMES,
     Bools,
     CompleterConfig,
     Window,
     correction_share,
+    growth,
     read_window,
 )
 from steadypose.prior.models.line import Line
@@ -46,6 +52,7 @@ from steadypose.training.data.dataset import (
     mirror_rotations,
 )
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.weights import arrays_of
 
 
 class Completer(nn.Module):
@@ -64,7 +71,7 @@ class Completer(nn.Module):
         with torch.no_grad():
             self.write.weight.mul_(0.05)  # start near the line
             self.write.bias.zero_()
-            self.write.bias[BENDS:] = 1.0
+            self.write.bias[BENDS:] = 2.0
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, T, OUTPUTS) of features (B, T, FEATURES)."""
@@ -97,14 +104,17 @@ class _Layer(nn.Module):
         return x + self.narrow(F.gelu(self.widen(self.norm2(x)), approximate="tanh"))
 
 
-ITERATIONS, BATCH, LEARNING_RATE = 20_000, 1536, 8e-4
+ITERATIONS, BATCH, LEARNING_RATE = 4_000, 36_000, 1.2e-3
 """Number of steps; frames per step; largest learning rate of AdamW, from which it falls along a cosine."""
 
-GAPS, CONTEXT = (5, 64), (2, 14)
+GAPS, CONTEXT = (3, 64), (2, 30)
 """Ranges of the length of a gap, and of the known context before and after it together, frames."""
 
-STRIDES, SCALES = (1, 1, 1, 2), (0.85, 1.15)
-"""Frame strides of windows, and range of factors on people's sizes."""
+SCALES = (0.85, 1.15)
+"""Range of factors on people's sizes."""
+
+TRAINED_SHARE = 20.0
+"""`SHARE_FRAMES` in training. Inference takes a smaller share, because other people's motion is predicted less well."""
 
 NOISY, NOISE = 0.3, 0.015
 """Share of windows with noisy known joints, and largest standard deviation of the noise along an axis, metres."""
@@ -112,7 +122,7 @@ NOISY, NOISE = 0.3, 0.015
 POSE_WEIGHT, PATH_WEIGHT, ROTATION_WEIGHT, VELOCITY_WEIGHT = 4.0, 4.0, 1.0, 10.0
 """Weights of root-relative joints and of the root, 1/m; of global rotation matrices; and of joints' steps, frames/m."""
 
-EASY = 0.05
+EASY = 0.02
 """Error added to the interpolation's error in the normalisation of a window's loss, metres. The normalisation keeps
 fast motion from dominating."""
 
@@ -138,15 +148,16 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
     def loss_of(model: Completer, count: int, _: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         gap, context = int(rng.integers(GAPS[0], GAPS[1] + 1)), int(rng.integers(CONTEXT[0], CONTEXT[1] + 1))
         frames = gap + context
-        rows = windows.sample(max(count // frames, 1), frames, STRIDES, rng)
+        rows = windows.sample(max(count // frames, 1), frames, (1,), rng)
         return loss(model, Truth.of(train, rows, rng), masks(len(rows), gap, context, rng), rng)
 
     def rise_and_fall(optimiser: Optimizer, steps: int) -> LRScheduler:
-        return OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps + 1, pct_start=0.05, final_div_factor=40)
+        return OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps + 1, pct_start=0.04, final_div_factor=4)
 
     recipe = Recipe(
         "completer", network, loss_of, lambda model: evaluate_completer(model, val), ITERATIONS, BATCH, LEARNING_RATE,
-        f"frames, in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]},", decay=0.01, schedule=rise_and_fall,
+        f"frames, in windows of {GAPS[0] + CONTEXT[0]} to {GAPS[1] + CONTEXT[1]},", decay=0.02, schedule=rise_and_fall,
+        average=0.999,
     )  # fmt: skip
     described = f"a transformer of {sizes.layers} layers, {sizes.width} wide, over a window's frames"
     data = describe_data(options.weights, train, val)
@@ -249,7 +260,7 @@ def predict(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
     with torch.autocast("cpu", torch.bfloat16, enabled=model.training):
         output = model(torch.from_numpy(window.features))
     rotations, root, gates = output.float().split([BENDS - 3, 3, 23], dim=-1)
-    share = torch.from_numpy(correction_share(line))
+    share = torch.from_numpy(correction_share(line, TRAINED_SHARE if model.training else SHARE_FRAMES))
     bend = torch.from_numpy(window.bend) * (1.0 - share * torch.sigmoid(-gates)[..., None])
     rotations = _anchored(rotations.unflatten(-1, (22, 6)), line, slice(0, 22))
     root = _anchored(root.unflatten(-1, (1, 3)), line, slice(22, 23))[:, :, 0]
@@ -313,33 +324,45 @@ def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) 
 
 
 HIDDEN_PARTS = (_ARMS[1], _ARMS[3], _LEGS[0], _LEGS[2], [J["head"], J["neck"]], _BETWEEN.tolist())
-"""Parts that are hidden to measure the errors of joints that are never known; the first part with a joint counts."""
+"""Parts that are hidden to measure the errors of their joints; the first part with a joint counts."""
+
+
+CALIBRATED = (15, 60)
+"""Lengths of the gaps in which parts are hidden to measure the errors of their joints, frames."""
 
 
 @torch.no_grad()
-def calibrate(model: Completer, motion: MotionSet, windows: int = 128) -> CompleterConfig:
-    """Return the configuration with the model's RMS errors along an axis, measured on validation motion.
+def calibrate(model: Completer, motion: MotionSet, windows: int = 100) -> CompleterConfig:
+    """Return the configuration with the RMS errors of `complete` along an axis, measured on validation motion, equally
+    on all sources.
 
-    The time constant, in frames, is fitted to the growth of the error from the ends of a gap.
+    Each part of the body is hidden for half a second and for two seconds. Each joint's error far from the ends, and the
+    distance at which it is half as large, are fitted to the growth of the errors from the ends (`growth`).
     """
-    never = np.full(22, np.nan)
-    for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
-        known = np.ones((50, 22), dtype=bool)
-        known[:, part] = False
-        off = _errors(model, motion, known, windows, squared=True)[0].mean(dim=0).sqrt().numpy() / np.sqrt(3)
-        never = np.where(np.isnan(never) & ~known[0], off, never)
-    gap = 60
-    known = np.ones((gap + 14, 22), dtype=bool)
-    known[7:-7] = False
-    off = _errors(model, motion, known, windows, squared=True)[0][7:-7].sqrt().numpy() / np.sqrt(3)
-    apart = np.minimum(np.arange(1, gap + 1), np.arange(gap, 0, -1))[:, None]
-    halves = np.arange(1.0, 61.0)
-    fits = [np.abs(np.log(never * apart / (apart + half)) - np.log(np.maximum(off, 1e-4))).mean() for half in halves]
-    return replace(
-        model.config,
-        never_sigma=tuple(round(float(v), 4) for v in never),
-        half_frames=float(halves[int(np.argmin(fits))]),
-    )
+    fill, before, after = PartsCompleter(LiveCompleter(model.config, arrays_of(model))), 7, 7
+    rows = motion.all_windows(before + max(CALIBRATED) + after, step=5)
+    source = motion.source[np.searchsorted(motion.clip_start, rows[:, 0], side="right") - 1]
+    names = np.unique(source)
+    rows = np.concatenate([_spread(rows[source == name], windows // len(names)) for name in names])
+    offsets, truth = motion.offsets[rows[:, 0]].double().numpy(), motion.positions[rows].double().numpy()
+    off, between = np.full((sum(CALIBRATED), 22), np.nan), np.empty(0)
+    for gap in CALIBRATED:
+        since = np.arange(1.0, gap + 1.0)
+        mine, hidden = slice(len(between), len(between) + gap), slice(before, before + gap)
+        between = np.append(between, 1.0 / (1.0 / since + 1.0 / since[::-1]))
+        for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
+            seen = truth.copy()
+            seen[:, hidden, part] = np.nan
+            done = np.stack([complete(fill, *window).positions for window in zip(seen, offsets, strict=True)])
+            found = np.sqrt(np.square(done - truth)[:, hidden].mean(axis=(0, 3)))
+            off[mine, part] = np.where(np.isnan(off[mine, part]), found[:, part], off[mine, part])
+    fits: list[tuple[float, Floats, float]] = []
+    for half in np.arange(1.0, 31.0):
+        grown = growth(between, half)[:, None]
+        far = np.sqrt(np.square(off).mean(axis=0) / np.square(grown).mean())
+        fits.append((float(np.abs(np.log(off / (far * grown))).mean()), far, float(half)))
+    _, far, half = min(fits, key=lambda fit: fit[0])
+    return replace(model.config, far_sigma=tuple(round(float(sigma), 4) for sigma in far), half_frames=half)
 
 
 def _errors(
@@ -347,7 +370,7 @@ def _errors(
 ) -> tuple[Tensor, Tensor]:
     """(T, 22) mean distances of joints from the truth, metres, or their mean squares, of prediction and line."""
     rows = motion.all_windows(len(known), step=5)
-    rows = rows[np.linspace(0, len(rows) - 1, windows).astype(int)]
+    rows = _spread(rows, windows)
     truth = Truth.of(motion, rows)
     window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
     rotations, root = truth.in_frame_of(window)
@@ -359,3 +382,7 @@ def _errors(
 
     base = torch.from_numpy(window.rotations).float(), torch.from_numpy(window.root).float()
     return error(*predict(model, window)), error(*base)
+
+
+def _spread(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    return rows[np.linspace(0, len(rows) - 1, count).astype(int)]

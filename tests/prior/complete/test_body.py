@@ -123,7 +123,7 @@ def test_a_second_opinion_counts_where_a_part_is_hidden_and_nowhere_else() -> No
     assert np.abs(placed - positions)[known].max() < 0.01
 
 
-@pytest.mark.parametrize(("frames", "share"), [(8, 0.8 * 9 / 75), (30, 0.8 * 31 / 75)])
+@pytest.mark.parametrize(("frames", "share"), [(8, parts.SHARE * 9 / 75), (30, parts.SHARE * 31 / 75)])
 def test_a_second_opinion_counts_less_in_a_short_gap(frames: int, share: float, monkeypatch) -> None:
     """In a gap of n frames between observations n + 1 apart, it has the (n + 1) / 75th of its share."""
     positions, hidden = waving(100), (slice(40, 40 + frames), [J["left_knee"], J["left_ankle"], J["left_foot"]])
@@ -168,6 +168,12 @@ def test_doubt_grows_from_what_is_known() -> None:
     sigma = Uncertainty((0.1,) * 22, 10.0, POSTURE).of(given_)
     assert (np.diff(sigma[19:30, 18]) > 0).all()
     assert (sigma[:19, 18] < 0.01).all()
+    given_[50:, 19] = np.nan
+    sigma = Uncertainty((0.1,) * 22, 10.0, POSTURE).of(given_)
+    noise = sigma[0]
+    half = np.hypot(0.05, noise[19])  # ten frames after its last frame, none follows
+    between = np.hypot(0.1 / (1.0 + (10.0 * 21.0 / 110.0) ** 2), noise[18])  # ten frames after one, eleven before one
+    np.testing.assert_allclose([sigma[59, 19], sigma[29, 18]], [half, between], rtol=1e-6)
 
 
 def test_doubt_of_a_joint_that_is_never_known_depends_on_what_is() -> None:

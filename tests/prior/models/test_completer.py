@@ -24,6 +24,7 @@ from steadypose.prior.models.completer_features import (
     solved_rotations,
 )
 from steadypose.prior.models.line import anchored, draw_line
+from steadypose.prior.models.weights import WeightsError
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes.completer import Completer, Truth, masks, predict, train_completer
@@ -128,7 +129,13 @@ def test_in_a_short_gap_little_is_taken_from_the_network() -> None:
     known[0, 10:15] = known[1, 5:] = False
     shares = correction_share(draw_line(known))
     assert np.allclose(shares[0, 10:15], 6 / SHARE_FRAMES)
+    assert np.allclose(correction_share(draw_line(known), 3.0)[0, 10:15], 1.0)
     assert (shares[1, 5:] == 1.0).all()
+
+
+def test_weights_of_an_earlier_version_are_refused() -> None:
+    with pytest.raises(WeightsError, match="train again"):
+        CompleterConfig.from_dict({"width": 16, "never_sigma": [0.1] * 22})
 
 
 def test_the_line_knows_what_is_before_and_after() -> None:
