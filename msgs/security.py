@@ -222,6 +222,7 @@ def create_keys(directory: str | Path) -> Keys:
 
     Raises:
         ValueError: a pair exists already. It is not replaced, because others may rely on it.
+        OSError: it cannot be written.
     """
     directory = Path(directory)
     (directory / "clients").mkdir(parents=True, exist_ok=True)
@@ -233,7 +234,12 @@ def create_keys(directory: str | Path) -> Keys:
         raise ValueError(f"{secret} exists already: expected a directory without keys, or use these") from error
     from zmq.auth import create_certificates
 
-    create_certificates(directory, _OWN)
+    try:
+        create_certificates(directory, _OWN)
+    except OSError:  # the disk is full: an empty file would be taken for a pair of keys
+        for half in (secret, secret.with_suffix(".key")):
+            half.unlink(missing_ok=True)
+        raise
     return load_keys(directory)
 
 

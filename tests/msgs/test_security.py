@@ -1,4 +1,5 @@
 import os
+import resource
 import tempfile
 import threading
 from collections.abc import Callable
@@ -72,6 +73,17 @@ def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
     secret_file.chmod(0o640)
     with pytest.raises(ValueError, match="chmod 600"):
         load_keys(tmp_path / "keys")
+
+
+def test_a_full_disk_leaves_no_empty_keys_that_later_calls_would_meet(tmp_path: Path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            create_keys(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert create_keys(tmp_path).secret
 
 
 def test_keys_that_are_none_are_refused(tmp_path: Path):
