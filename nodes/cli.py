@@ -126,8 +126,9 @@ def _run(name: str, arguments: list[str]) -> object:
 
 
 def _prepare_help(documented: Iterable[Any]) -> None:
-    """Join each argument's description into one line, because tyro keeps the source's line breaks; and have tyro leave
-    out "(default: None)", because the description says what happens without the argument.
+    """Join each argument's description into one line, because tyro keeps the source's line breaks, as it does in a
+    paragraph before a line that begins with a sign; and have tyro leave out "(default: None)", because the description
+    says what happens without the argument.
     """
     from tyro.conf import arg
 
@@ -135,6 +136,7 @@ def _prepare_help(documented: Iterable[Any]) -> None:
         doc = getattr(thing, "__doc__", None) or ""
         if callable(thing) and "\n    Args:\n" in doc:
             described, heading, listed = doc.partition("\n    Args:\n")
+            described = re.sub(r"(?m)^((?: {4})?\S.*)\n {4}(?=[^\w\s])", r"\1 ", described)
             thing.__doc__ = described + heading + re.sub(r"\n {12}(?=\S)", " ", listed)
             with suppress(NameError):  # of a class that is imported, and annotated for type checkers alone
                 hints = get_type_hints(thing, include_extras=True)

@@ -71,7 +71,7 @@ class PrintBoard:
     """
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    paper: str = "a3"
+    paper: Annotated[str, tyro.conf.arg(metavar="NAME")] = "a3"
     columns: int = Board.columns
     rows: int = Board.rows
 

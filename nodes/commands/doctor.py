@@ -6,8 +6,9 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
     from steadypose.msgs.types import PoseRaw
 
 
-def doctor(live: bool = False, launch: str = "replay") -> int:
+def doctor(live: bool = False, launch: Annotated[str, tyro.conf.arg(metavar="FILE")] = "replay") -> int:
     """Check this machine: what works, what is missing, and which command mends it.
 
     Try:

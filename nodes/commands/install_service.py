@@ -174,9 +174,9 @@ def _command(*words: str) -> Step:
 
 
 def install_service(
-    launch: Annotated[str, tyro.conf.Positional] = "oak",
-    name: str = "steadypose",
-    user: str = "",
+    launch: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[LAUNCH]")] = "oak",
+    name: Annotated[str, tyro.conf.arg(metavar="NAME")] = "steadypose",
+    user: Annotated[str, tyro.conf.arg(metavar="USER", help_behavior_hint="")] = "",
     dry_run: bool = False,
     uninstall: bool = False,
 ) -> int:

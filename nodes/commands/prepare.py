@@ -28,9 +28,9 @@ class PrepareError(ValueError):
 
 
 def prepare(
-    mocap: Path,
-    out: Path = Path("data"),
-    speeds: tuple[float, ...] = (1.0,),
+    mocap: Annotated[Path, tyro.conf.arg(metavar="IN")],
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("data"),
+    speeds: Annotated[tuple[float, ...], tyro.conf.arg(metavar="X")] = (1.0,),
     rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
     """Convert motion capture to training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.

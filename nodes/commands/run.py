@@ -44,7 +44,7 @@ STALL_NS = 15_000_000_000
 
 
 def run(
-    launch: Annotated[str, tyro.conf.Positional] = REPLAY,
+    launch: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[LAUNCH]")] = REPLAY,
     input: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     rate: Annotated[float | None, tyro.conf.arg(metavar="X")] = None,
     loop: bool = False,

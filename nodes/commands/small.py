@@ -15,7 +15,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 
-def keys(directory: Path) -> None:
+def keys(directory: Annotated[Path, tyro.conf.arg(metavar="DIR")]) -> None:
     """Make a pair of CurveZMQ keys, so that only the subscribers that you list can receive messages.
 
     Make one on each machine. On the publishing machine, put own.key of each subscriber into clients/; on each
@@ -66,9 +66,9 @@ def repair(
 
 
 def simulate(
-    out: Annotated[Path, tyro.conf.Positional],
-    stream: tuple[str, ...] = (),
-    manifest: Path | None = None,
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
+    stream: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = (),
+    manifest: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
 ) -> None:
     """Simulate recordings of a depth camera, with the ground truth on the topic pose/truth.
 
@@ -95,7 +95,7 @@ def simulate(
 
 
 def plot(
-    recording: Annotated[Path, tyro.conf.Positional],
+    recording: Annotated[Path, tyro.conf.arg(metavar="IN")],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
     body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,

@@ -13,9 +13,6 @@ import tyro
 
 from steadypose.nodes.settings import LaunchError
 from steadypose.training.data.datasets import WeightSet
-from steadypose.training.distributed import join, set_threads, writes
-from steadypose.training.loop import TrainingOptions
-from steadypose.training.weights import install as install_weights
 
 RECIPES = {
     "hmvae": ("hmvae", "train_hmvae"),
@@ -83,6 +80,11 @@ def train(
         threads: CPU threads; with torchrun, of all processes of a machine together.
         install: replace the bundled weights of this set; the old ones move to the folder 'previous' beside them.
     """
+    # here, so that --help needs no torch
+    from steadypose.training.distributed import join, set_threads, writes
+    from steadypose.training.loop import TrainingOptions
+    from steadypose.training.weights import install as install_weights
+
     join()
     set_threads(threads)
     name = weights or ("kinect_v2" if model == "correction" else "default")

@@ -1,6 +1,7 @@
 import ast
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -137,7 +138,7 @@ def test_what_needs_no_torch_does_not_import_it_and_what_an_extra_brings_is_name
 import sys
 from contextlib import redirect_stderr
 from steadypose.nodes.cli import USAGE_ERROR, main
-for command in ("run", "node", "keys", "echo", "info"):
+for command in ("run", "node", "keys", "echo", "info", "train"):
     try:
         main([command, "--help"])
     except SystemExit as end:
@@ -156,7 +157,7 @@ for missing, (_, arguments) in {lacking}.items():
 
 
 @pytest.mark.parametrize(
-    "command", [["run"], ["clean"], ["plot"], pytest.param(["train"], marks=pytest.mark.slow), ["calibrate", "floor"]]
+    "command", [*([name] for name in COMMANDS if name != "node"), ["calibrate", "floor"], ["calibrate", "board"]]
 )
 def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -167,6 +168,13 @@ def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monke
     words = {word for line in lines for word in line.split()}
     assert not any("{None" in word for word in words)
     assert "None)" not in words, "no default beside the one that is described"
+    assert not {"STR", "[STR]", "PATH"} & {line.split()[0] for line in lines if line[:2] == "  " and line.strip()}, (
+        "a name says more"
+    )
+    text = lines[lines.index("") :]
+    for line, after in pairwise(text):
+        if line[:1].strip() and after[:1].strip():
+            assert len(line) + 1 + len(after.split()[0]) > 80, f"broken early: {line}"
     assert words >= {"steadypose", "options"}
     assert not any(line.strip() in ("the", "own", "any") for line in lines), "no line of a docstring shows"
     assert main(["help"]) == 0
