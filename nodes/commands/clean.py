@@ -20,6 +20,7 @@ from steadypose.nodes.commands.output import (
     clean_recording,
     console,
     plural,
+    print_refused,
     printable,
 )
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
@@ -112,8 +113,7 @@ def clean(
         )
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
     terminal.print(f"{out}: {plural(done.frames, 'frame', 'frames')}, {spent}")
-    for cause, count in done.refused.items():
-        terminal.print(f"  not used as given, {cause}: {count}")
+    print_refused(terminal, done.refused)
     for problem in done.problems:
         terminal.print(f"  {problem}", style="yellow")
     if not done.poses:

@@ -7,7 +7,16 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from steadypose.nodes.commands.output import File, In, Out, check_poses_file, console, plural, write_output
+from steadypose.nodes.commands.output import (
+    File,
+    In,
+    Out,
+    check_poses_file,
+    console,
+    plural,
+    print_refused,
+    write_output,
+)
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.offline import CompletedSource, complete_source, load_completer
@@ -113,8 +122,7 @@ def complete(
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for other in alternatives.values():
         terminal.print(f"  wrote an alternative: {other}")
-    for cause, count in completed.refused.items():
-        terminal.print(f"  not used as given, {cause}: {count}")
+    print_refused(terminal, completed.refused)
     for problem in completed.problems:
         terminal.print(f"  {problem}", style="yellow")
     if picture is not None:

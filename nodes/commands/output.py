@@ -46,6 +46,13 @@ OTHER_FORMATS = {
 """endings that are never meant as a recording's name, which is that of a folder"""
 
 
+def print_refused(terminal: Console, refused: Mapping[str, int]) -> None:
+    """Print in one line what was not used as given, by cause."""
+    if refused:
+        counts = ", ".join(f"{count} {cause.replace('_', ' ')}" for cause, count in refused.items())
+        terminal.print(f"  not used as given: {counts}")
+
+
 def check_output(source: Path, *outputs: Path) -> None:
     """Raises LaunchError if an output is the input, or its folder does not exist."""
     for out in outputs:

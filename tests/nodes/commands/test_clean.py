@@ -19,6 +19,7 @@ from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import NpzError
+from steadypose.prior.body.skeleton import J
 
 FRAMES = 25
 
@@ -58,6 +59,14 @@ def test_a_single_frame_is_counted_as_one(tmp_path: Path, capsys: pytest.Capture
     assert "out.npz: 1 frame, " in capsys.readouterr().err
     info(str(source))
     assert "1 frame," in capsys.readouterr().out
+
+
+def test_what_was_not_used_is_said_in_one_line_of_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    far = walked(30)
+    far[3, J["left_wrist"]] += 40.0
+    far[20, J["left_wrist"]] += 1.0
+    assert clean(write_npz(tmp_path / "in.npz", far), tmp_path / "out.npz") == 0
+    assert "  not used as given: 1 joints too far, 1 joints refused\n" in capsys.readouterr().err
 
 
 def test_jittered_stamps_come_back_as_they_were(tmp_path: Path) -> None:
