@@ -229,3 +229,14 @@ def test_every_nth_clip_of_each_person_is_read(monkeypatch) -> None:
     np.testing.assert_array_equal(one.kinect, pair.kinect)
     np.testing.assert_array_equal(one.raw[:, wrist], to_canonical(KINECT22, pair.kinect)[0][:, J["left_wrist"]])
     np.testing.assert_array_equal(one.centres[:, wrist], pair.vicon[:, J["left_wrist"]])
+
+
+def test_regressions_learn_and_run_on_clips_smoothed_for_their_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, regression = [], kinect_methods.kinect_regression
+    monkeypatch.setattr(regression, "smoothed", lambda clips, scored, *given: asked.append(given) or [None])
+    monkeypatch.setattr(regression, "ridge", lambda *_: lambda one: one)
+    monkeypatch.setattr(regression, "temporal_convolution", lambda *given, seed: asked.append(given[3:]) or given[0])
+    learners = kinect_methods.Learners([clip(0, 12)], {0: 1.0, 8: 2.0}, steps=7)
+    learners.ridge(8).run([clip(1, 12)])
+    learners.convolution(8)
+    assert asked == [(8, 0, 2.0), (8, 0, 2.0), (8, 4, 2.0), (4, 7)]
