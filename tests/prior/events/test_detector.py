@@ -217,6 +217,12 @@ def test_who_points_points_from_the_head_through_the_wrist() -> None:
     np.testing.assert_allclose(direction, expected / np.linalg.norm(expected), atol=1e-6)
 
 
+@pytest.mark.parametrize(("speed", "points"), [(0.3, True), (0.5, False)])
+def test_an_arm_that_moves_points_only_below_04_m_s(speed: float, points: bool) -> None:
+    moving = [pointing() + [0.0, speed * frame / 30.0, 0.0] for frame in range(-10, 10)]
+    assert (first(changes([*STILL, *moving]), EventKind.POINTS) < NEVER) is points
+
+
 def test_the_sensor_that_is_faced_is_where_it_is_said_to_be() -> None:
     def faces(sensor: list[float]) -> bool:
         detector = EventDetector()
