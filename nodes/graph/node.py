@@ -38,7 +38,7 @@ from steadypose.nodes.graph.health import STALL_NS, Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.process import ALIVE, READY, notify
-from steadypose.nodes.graph.relay import CONTEXT, Relay
+from steadypose.nodes.graph.relay import Relay
 from steadypose.nodes.graph.topology import NODES, Delivery
 
 logger = logging.getLogger(__name__)
@@ -68,6 +68,8 @@ class Node(ABC):
 
     name: ClassVar[str]
     """the node's name in `topology.NODES`"""
+    _lag = 0
+    """number of acknowledged messages that a restarted process of this node publishes again"""
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         if extra := NODES[self.name].extra:
@@ -155,8 +157,7 @@ class Node(ABC):
         keys = transport.curve_keys()
         folder, declared = transport.make_ipc_directory(), NODES[self.name]
         if not declared.subscribes or (transport.lossless and declared.delivery is not Delivery.BEST_EFFORT):
-            lag = CONTEXT if transport.lossless and not declared.subscribes else 0
-            self._relay = Relay(folder / f"{self.name}.progress", declared.publishes, self._supervisor, lag)
+            self._relay = Relay(folder / f"{self.name}.progress", declared.publishes, self._supervisor, self._lag)
         with ExitStack() as stack:
             self._publisher = stack.enter_context(
                 Publisher(

@@ -13,6 +13,7 @@ from steadypose.nodes.checks.problem import Problem
 from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.relay import CONTEXT
 from steadypose.nodes.sources.image import NAME as IMAGE
 from steadypose.nodes.sources.recording import end_of
 from steadypose.nodes.sources.registry import InputSettings, open_input
@@ -63,6 +64,8 @@ class PoseInputNode(Node):
             clear_text=transport.clear_text,
             image_file=transport.ipc_directory / IMAGE if settings.image else None,
         )
+        if transport.lossless and not isinstance(self._source, LiveSource):  # a camera cannot repeat its frames
+            self._lag = CONTEXT
         self._rate = settings.rate
         self._loop = settings.loop
         self._pose = settings.calibration.pose
@@ -96,6 +99,7 @@ class PoseInputNode(Node):
                         self.publish(POSE_RAW, self._with_pose(frame))
                     except ValueError as error:  # more bodies than a message holds
                         self.refuse(POSE_RAW, error)
+                    self.settle()  # a restarted process continues the sequence numbers; older ones would be refused
                 self.report_if_due()
 
     def _play(self, source: RecordedSource) -> None:

@@ -1,23 +1,27 @@
+import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import START_NS, VirtualClock, raw, record, walk, walking
+from conftest import START_NS, VirtualClock, raw, record, running, walk, walking
 
 from steadypose.msgs.delivery import Deliveries
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW, POSE_TRUTH
+from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Message, PoseRaw, PoseWorld
 from steadypose.nodes.graph.launch import Launch
+from steadypose.nodes.graph.node import SUPERVISOR
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import NpzError, NpzSource
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import RecordingSource, open_recording
 from steadypose.nodes.sources.registry import InputSettings
+from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.clean.admission import MAX_DISTANCE
 
 MakeLaunch = Callable[..., Launch]
@@ -74,6 +78,26 @@ def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None
     return [(at, message) for at, message in sent.at if isinstance(message, PoseRaw)][:frames]
 
 
+class Camera(LiveSource):
+    """Gives so many frames as soon as the test subscribes, then none."""
+
+    node: PoseInputNode
+
+    def __init__(self, frames: list[PoseRaw]) -> None:
+        super().__init__()
+        self._frames = frames
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        while "test" not in self.node._publisher.subscribers:
+            yield None
+        yield from self._frames
+        while True:
+            yield None
+
+    def status(self) -> dict[str, str]:
+        return {}
+
+
 def waits(sent: list[tuple[int, PoseRaw]]) -> list[float]:
     """Seconds between one message and the next."""
     return [(b - a) / 1e9 for (a, _), (b, _) in pairwise(sent)]
@@ -124,6 +148,25 @@ def test_what_is_waited_for(launch: Launch, clock: VirtualClock, seconds: list[i
     sent = play(launch, clock, Frames(stamps))
     assert [m.stamp_ns for _, m in sent[:-1]] == stamps, "stamps are as captured"
     assert waits(sent)[:-1] == pytest.approx(waited)
+
+
+@pytest.mark.parametrize("lossless", ["true", "false"])
+def test_a_camera_whose_process_is_killed_is_heard_again_at_once(
+    lossless: str, make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(SUPERVISOR, str(os.getppid()))
+    launch, frames = make_launch(nodes='["pose_input"]', transport__lossless=lossless), walk(20)
+    with Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW, name="test") as subscriber:
+        for of_process in (frames[:10], frames[10:]):
+            camera = Camera(of_process)
+            camera.node = PoseInputNode(launch, source=camera)
+            with running(camera.node):  # if it is stopped, it leaves what it leaves if it is killed
+                for frame in of_process:
+                    received = subscriber.receive(10)
+                    assert received
+                    assert received[1].stamp_ns == frame.stamp_ns
+            assert camera.node.settle(), "messages that nobody waits for fill no memory"
+    assert not subscriber.refused + subscriber.dropped
 
 
 def test_a_loop_goes_on_with_rising_stamps(launch: Launch, clock: VirtualClock) -> None:
