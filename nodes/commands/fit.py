@@ -127,10 +127,10 @@ def _fit_poses(
 def _line(fit: Fit) -> str:
     who = f"body {fit.seen.id}, {len(fit.misfit)} frames"
     if fit.track is None:
-        return f"{who}: not explained, left as `clean` has it and flagged"
+        return f"{who}: the fit failed; the result of `clean` is kept and flagged"
     known = fit.misfit[np.isfinite(fit.misfit)]
-    far = f"; joints seen lie {np.median(known) * 1e3:.0f} mm off in the median" if len(known) else ""
-    kept = f"; the motion model explains {fit.track.kept.sum()} of {len(fit.track.kept)} windows"
+    far = f"; median residual of observed joints {np.median(known) * 1e3:.0f} mm" if len(known) else ""
+    kept = f"; third stage kept in {fit.track.kept.sum()} of {len(fit.track.kept)} windows"
     return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}{kept}"
 
 
@@ -151,7 +151,7 @@ def _fit_picture(
     write_output(out, lambda: with_bones(arrays_of_fit(recording, track), track), tuple)
     misfit = track.misfit[0]
     _explain(out, [(0, recording.stamps_ns, misfit, track)], "pixels")
-    off = f"key points lie {np.nanmedian(misfit):.1f} pixels off in the median"
+    off = f"median residual of key points {np.nanmedian(misfit):.1f} pixels"
     return frames, [track], [off, *check_up(recording)]
 
 
@@ -167,7 +167,7 @@ def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> 
         path = out.with_name(f"{out.name}.smpl.{number}.npz")
         np.savez(path, **motion.arrays)
         off = np.linalg.norm(motion.joints - track.joints, axis=-1).mean() * 1e3
-        lines.append(f"{path.name}: SMPL's joints lie {off:.0f} mm off the fitted ones in the mean")
+        lines.append(f"{path.name}: mean distance of SMPL's joints from the fitted ones {off:.0f} mm")
     return lines
 
 

@@ -109,7 +109,7 @@ def test_the_overview_compares_with_the_nearest_baseline_of_the_cell_that_waits_
     assert "| Noise | 2 | 1 | 0.96 | 1.02 (2 cm, delay 4) | 0 | 0.75 | 1.00 (2 cm, delay 0) |" in shown
 
 
-def test_the_readme_says_in_how_many_cells_a_baseline_is_nearer() -> None:
+def test_the_readme_says_in_how_many_cells_a_baseline_is_more_accurate() -> None:
     cells = {
         (study, name): position
         for study, error in ERRORS.items()
@@ -120,7 +120,7 @@ def test_the_readme_says_in_how_many_cells_a_baseline_is_nearer() -> None:
     percent = round(100 * max(worse.values()) - 100)
     text = " ".join((ROOT / "README.md").read_text().split())
     assert f"Of {len(cells)} cells" in text
-    assert f"is nearer in {len(worse)}, all MediaPipe's, by up to {percent} %" in text
+    assert f"is more accurate in {len(worse)}, all MediaPipe's, by up to {percent} %" in text
 
 
 def test_two_errors_that_are_next_to_nothing_are_equal() -> None:

@@ -115,7 +115,7 @@ def test_points_of_nobody_are_as_none(tmp_path: Path) -> None:
 def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path, capsys) -> None:
     np.savez(tmp_path / "model.npz", **model_arrays())
     assert main(["fit", str(seen), str(tmp_path / "out.npz"), "--smpl", str(tmp_path / "model.npz")]) == 0
-    assert "SMPL's joints lie" in capsys.readouterr().err
+    assert "mean distance of SMPL's joints" in capsys.readouterr().err
     with (tmp_path / "out.npz.smpl.0.npz").open("rb") as file:
         fps, read = read_amass(file)
     with np.load(tmp_path / "out.npz") as out:
