@@ -83,8 +83,6 @@ class Ledger:
 
     def __init__(self, launch: Launch) -> None:
         self._launch = launch
-        # a lossless node itself continues its predecessor's counts of received and published messages
-        self._restarted = LOSSES if launch.transport.lossless else (*LOSSES, "in.", "count.")
         self._before: dict[str, Counter[str]] = {}
         self._latest: dict[str, Diagnostics] = {}
         self._restarts: Counter[str] = Counter()
@@ -105,7 +103,10 @@ class Ledger:
         return dataclasses.replace(diagnostics, values=diagnostics.values | total)
 
     def _counts(self, diagnostics: Diagnostics) -> Counter[str]:
-        return Counter({k: int(n) for k, n in diagnostics.values.items() if k.startswith(self._restarted)})
+        # a source, and a lossless node, itself continues its predecessor's counts of received and published messages
+        goes_on = self._launch.transport.lossless or not NODES[diagnostics.node].subscribes
+        restarted = LOSSES if goes_on else (*LOSSES, "in.", "count.")
+        return Counter({k: int(n) for k, n in diagnostics.values.items() if k.startswith(restarted)})
 
     def away(self, node: str, reports: dict[str, Diagnostics]) -> dict[str, str]:
         """Number of messages per topic that a node missed while it was down, from the last reports of all nodes.

@@ -329,6 +329,9 @@ def test_what_was_dropped_before_a_restart_stays_dropped(make_launch: Callable[.
     assert after.values["dropped.late"] == "4"
     # a lossless node counts on itself
     assert after.values["count.pose/clean"] == {"true": "25", "false": "45"}[lossless]
+    ledger.note(report("pose_input", count__pose__raw=20), 0)
+    after = ledger.note(report("pose_input", count__pose__raw=25), 1)
+    assert after.values["count.pose/raw"] == "25", "so does a source"
 
 
 def test_a_live_stream_is_published_for_nobody_while_a_node_is_away(make_launch: Callable[..., Launch]) -> None:
