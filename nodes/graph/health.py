@@ -53,6 +53,7 @@ class Health:
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
         self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
+        self._inherited: Counter[str] = Counter()
         self._published_before: Counter[str] = Counter()
         self._rates: dict[str, float] = {}
         self._lost_before = 0
@@ -65,6 +66,7 @@ class Health:
 
     def go_on_from(self, published: Mapping[str, int]) -> None:
         """Continue counting from what this node's predecessor had published."""
+        self._inherited = Counter(published)
         self.published.update(published)
         self._published_before.update(published)
 
@@ -129,8 +131,9 @@ class Health:
         values |= {f"count.{topic}": str(n) for topic, n in self.published.items()}
         values |= {f"in.{topic}": str(n) for topic, n in self.received.items()}
         values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
+        own = self.published - self._inherited
         values |= {
-            f"mean_rate.{topic}": f"{(self.published[topic] - 1) * 1e9 / max(last - first, 1):.2f}"
+            f"mean_rate.{topic}": f"{(own[topic] - 1) * 1e9 / max(last - first, 1):.2f}"
             for topic, (first, last) in self._first_and_last_ns.items()
         }
         values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)

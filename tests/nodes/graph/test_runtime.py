@@ -1,3 +1,4 @@
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, cycle
@@ -13,6 +14,7 @@ from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import EventKind, Level, Message, Phase, PoseClean, PoseEvents, PoseRaw, PoseWorld
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.events_node import EventsNode, EventStream
+from steadypose.nodes.graph.health import Health
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import POSE_NODES, publishers
@@ -192,6 +194,17 @@ def test_input_without_output_is_not_called_running(make_launch: MakeLaunch, clo
         node.health.note_received(POSE_RAW)
         clock.time_ns += 60_000_000_000
         assert node.diagnostics().values["state"] == "running", "nothing comes any more: that is no fault of its own"
+
+
+def test_a_restarted_node_counts_on_and_its_rates_are_its_own(clock: VirtualClock) -> None:
+    health = Health(clock)
+    health.go_on_from({POSE_RAW: 1000})
+    for _ in range(31):
+        health.note_published(POSE_RAW, clock.time_ns, None)
+        clock.time_ns += 50_000_000
+    values = health.report("pose_input", Counter(), {}).values
+    assert values[f"count.{POSE_RAW}"] == "1031"
+    assert values[f"rate.{POSE_RAW}"] == values[f"mean_rate.{POSE_RAW}"] == "20.00"
 
 
 HOUR_NS = 3_600_000_000_000
