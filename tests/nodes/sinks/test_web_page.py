@@ -82,6 +82,7 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
     send(server, "diagnostics", diagnostics())
     until(lambda: page.text_content("#events") == "7: left hand raised", timeout_s=SOON_S)
     until(lambda: "prior" in page.text_content("#health"), timeout_s=SOON_S)
+    assert page.locator("table").inner_text().split()[:3] == ["node", "rate", "latency"], "what its columns are"
     until(lambda: min(pixels(page, LEFT), pixels(page, RIGHT)) > 500)
     assert pixels(page, BACKGROUND) > 100_000
 
