@@ -200,7 +200,9 @@ def names_of(world: PoseWorld, source: str) -> tuple[dict[str, WorldBody], int]:
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
 OWN_TOPICS = {PoseRaw: "pose_raw", PoseClean: "pose_clean", PoseWorld: "pose_world", PoseEvents: "pose_events"}
 GROWN = 0.02
-"""Change of a link's length at which the body's URDF is published again, metres."""
+"""Change of a link's mean length at which the body's URDF is published again, metres."""
+MEAN_OF = 300
+"""Number of frames over which links' lengths are averaged. Single frames' lengths differ by centimetres."""
 OF_BODY = ("joint_states", "odom", "urdf")
 """Topics of each body."""
 
@@ -226,7 +228,8 @@ class BodyTopics:
         self._output, self._settings, self._several = output, settings, several
         self._root_covariance = RootCovariance()
         self._names: dict[str, list[str]] = {}  # of the bodies of each source's newest message
-        self._measured: dict[str, dict[str, np.ndarray]] = {}
+        self._means: dict[str, tuple[int, dict[str, np.ndarray]]] = {}  # number of frames, and mean measures
+        self._measured: dict[str, dict[str, np.ndarray]] = {}  # as published
         self._still: dict[str, Pose] = {}
         self._moving: set[str] = set()
 
@@ -253,6 +256,7 @@ class BodyTopics:
 
     def _drop(self, names: Iterable[str]) -> None:
         for gone in names:
+            self._means.pop(gone, None)
             self._measured.pop(gone, None)
             for topic in OF_BODY:
                 self._output.drop(f"{BODIES}/{gone}/{topic}")
@@ -286,10 +290,14 @@ class BodyTopics:
         return self._root_covariance(positions[None], sigma[None], rotation_matrix(body.root_orientation)[None])[0]
 
     def _send_urdf(self, name: str, measured: dict[str, np.ndarray]) -> None:
+        frames, mean = self._means.get(name, (0, measured))
+        frames = min(frames + 1, MEAN_OF)
+        mean = {link: at + (measured[link] - at) / frames for link, at in mean.items()}
+        self._means[name] = frames, mean
         last = self._measured.get(name)
-        if last is None or max(np.abs(measured[link] - at).max() for link, at in last.items()) > GROWN:
-            self._measured[name] = measured
-            told = new("std_msgs/msg/String", data=urdf(name, measured))
+        if last is None or max(np.abs(mean[link] - at).max() for link, at in last.items()) > GROWN:
+            self._measured[name] = mean
+            told = new("std_msgs/msg/String", data=urdf(name, mean))
             self._send(f"{BODIES}/{name}/urdf", told, latched=True)
 
     def _send_sensor(self, clean: PoseClean) -> None:

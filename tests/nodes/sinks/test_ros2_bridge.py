@@ -229,6 +229,19 @@ def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(stream: S
     assert kept.of("humans/bodies/tracked")[-1].ids == []
 
 
+def test_the_urdf_is_of_mean_lengths_and_changes_with_them_alone(stream: Stream) -> None:
+    kept, world, rng = Kept(), stream[1][-1], np.random.default_rng(0)
+    topics, counts = BodyTopics(kept, Ros2BridgeSettings()), []
+    for size in (1.0, 1.2):
+        for _ in range(200):
+            body = world.bodies[1]
+            positions = (size * body.positions + rng.normal(0.0, 0.015, (22, 3))).astype(np.float32)
+            topics.send(dataclasses.replace(world, bodies=[dataclasses.replace(body, positions=positions)]))
+        counts.append(len(kept.of("humans/bodies/b1/urdf")))
+    assert counts[0] < 10
+    assert counts[0] < counts[1] < 20
+
+
 def test_sources_have_bodies_of_their_own_until_they_fall_silent(
     make_launch: Callable[..., Launch], clock: VirtualClock, stream: Stream
 ) -> None:
