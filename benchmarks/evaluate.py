@@ -87,7 +87,7 @@ def evaluate(
                 console.print(f"wrote {_file(name, room, bench, result, module, seconds, out)}", highlight=False)
             wrong += result.wrong
     if out is None:
-        console.print("written nowhere: --out DIR, or --split test without --quick, writes", highlight=False)
+        console.print("nothing was saved: pass --out DIR, or --split test without --quick", highlight=False)
     for line in wrong:
         console.print(line, markup=False)
     return int(bool(wrong))

@@ -103,7 +103,8 @@ class RecordingWriter(Closing):
                 self.directory.mkdir(parents=True)
             self._part = _Part(self.directory, number)
         except OSError as error:
-            raise RecordingError(f"cannot record to {directory}: {error.strerror}") from error
+            remedy = "; expected a new name" if isinstance(error, FileExistsError) else ""
+            raise RecordingError(f"cannot record to {directory}: {error.strerror}{remedy}") from error
 
     def write(self, topic: str, message: Message, stamp_ns: int) -> None:
         """Append a message with the log time `stamp_ns` (0 or later). Stamps need not increase.

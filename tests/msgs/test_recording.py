@@ -210,7 +210,7 @@ def test_an_empty_recording_is_refused(tmp_path: Path):
 
 def test_a_recording_is_not_overwritten(whole: Path):
     before = mcap_of(whole).read_bytes()
-    with pytest.raises(RecordingError, match=r"cannot record to .*: File exists"):
+    with pytest.raises(RecordingError, match=r"cannot record to .*: File exists; expected a new name"):
         RecordingWriter(whole)
     assert mcap_of(whole).read_bytes() == before
 
