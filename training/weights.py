@@ -47,15 +47,21 @@ def install(path: Path) -> Path:
     """Copy the weights ``MODEL-SET.safetensors`` of a training run, and the files that belong to them, to the folder
     where nodes look for a weight set; returns their new path.
 
-    Replaced files are moved to the folder ``previous`` there.
+    Replaced files are moved to the folder ``previous`` there, and back if the new ones cannot be written (OSError).
     """
     folder = weights_io.WEIGHTS
     (folder / "previous").mkdir(parents=True, exist_ok=True)
-    for old in _belonging(folder / path.name):
+    replaced = _belonging(folder / path.name)
+    for old in replaced:
         os.replace(old, folder / "previous" / old.name)
-    for new in _belonging(path):
-        with whole(folder / new.name) as file:
-            file.write(new.read_bytes())
+    try:
+        for new in _belonging(path):
+            with whole(folder / new.name) as file:
+                file.write(new.read_bytes())
+    except OSError:
+        for old in replaced:
+            os.replace(folder / "previous" / old.name, old)
+        raise
     return folder / path.name
 
 

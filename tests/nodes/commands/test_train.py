@@ -48,6 +48,15 @@ def test_installed_weights_replace_the_old_which_are_kept(shipped: Path, tmp_pat
     assert str(shipped / made.name) in capsys.readouterr().out
 
 
+def test_weights_that_cannot_be_installed_leave_the_old_ones(shipped: Path, tmp_path: Path) -> None:
+    made = tmp_path / "hmvae-default.safetensors"
+    made.write_text("new")
+    (shipped / "hmvae-default.safetensors.part").mkdir()  # where the new file would be written
+    with pytest.raises(IsADirectoryError):
+        training_weights.install(made)
+    assert {(shipped / f"hmvae-default.{end}").read_text() for end in ("safetensors", "md")} == {"shipped"}
+
+
 def test_options_that_cannot_be_used_are_refused_by_name() -> None:
     with pytest.raises(LaunchError, match="--iterations: expected 1 or more, got 0"):
         command.train("correction", iterations=0)
