@@ -292,8 +292,12 @@ def loopback_keys() -> Keys:
     directory = local_directory()
     make_private(directory)
     folder = directory / "loopback"
-    with suppress(ValueError):  # raised if they exist
+    try:
         return create_keys(folder)
+    except OSError as error:
+        raise TransportError(f"{folder}: expected to write keys there: {error.strerror}") from error
+    except ValueError:
+        pass  # they exist
     deadline = time.monotonic() + MADE_S
     while True:
         try:

@@ -4,6 +4,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -108,6 +109,14 @@ def test_two_processes_that_make_the_keys_at_once_have_the_same(tmp_path: Path, 
         thread.join()
     assert len(made) == 8
     assert len({keys.secret for keys in made}) == 1
+
+
+def test_keys_that_find_no_room_are_an_error_that_names_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+    monkeypatch.setattr("zmq.auth.create_certificates", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(TransportError, match=r"loopback: .*No space left"):
+        loopback_keys()
 
 
 @pytest.mark.parametrize("part", [".", "clients", "servers"])
