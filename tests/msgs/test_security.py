@@ -1,5 +1,4 @@
 import os
-import resource
 import tempfile
 import threading
 from collections.abc import Callable
@@ -76,14 +75,15 @@ def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
         load_keys(tmp_path / "keys")
 
 
-def test_a_full_disk_leaves_no_empty_keys_that_later_calls_would_meet(tmp_path: Path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
+def test_a_full_disk_leaves_no_empty_keys_that_later_calls_would_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def write(directory: Path, name: str) -> None:
+        (directory / f"{name}.key").touch()
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr("zmq.auth.create_certificates", write)
+        with pytest.raises(OSError, match="No space left"):
             create_keys(tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert create_keys(tmp_path).secret
 
 
