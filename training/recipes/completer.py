@@ -365,20 +365,16 @@ def calibrate(model: Completer, motion: MotionSet, windows: int = 100) -> Comple
     return replace(model.config, far_sigma=tuple(round(float(sigma), 4) for sigma in far), half_frames=half)
 
 
-def _errors(
-    model: Completer, motion: MotionSet, known: Bools, windows: int, *, squared: bool = False
-) -> tuple[Tensor, Tensor]:
-    """(T, 22) mean distances of joints from the truth, metres, or their mean squares, of prediction and line."""
-    rows = motion.all_windows(len(known), step=5)
-    rows = _spread(rows, windows)
+def _errors(model: Completer, motion: MotionSet, known: Bools, windows: int) -> tuple[Tensor, Tensor]:
+    """(T, 22) mean distances of joints from the truth, metres, of prediction and line."""
+    rows = _spread(motion.all_windows(len(known), step=5), windows)
     truth = Truth.of(motion, rows)
     window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
     rotations, root = truth.in_frame_of(window)
     aim, _ = forward_kinematics(rotations, truth.offsets[:, None], root)
 
     def error(rotations: Tensor, root: Tensor) -> Tensor:
-        off = (forward_kinematics(rotations, truth.offsets[:, None], root)[0] - aim).norm(dim=-1)
-        return (off.square() if squared else off).mean(dim=0)
+        return (forward_kinematics(rotations, truth.offsets[:, None], root)[0] - aim).norm(dim=-1).mean(dim=0)
 
     base = torch.from_numpy(window.rotations).float(), torch.from_numpy(window.root).float()
     return error(*predict(model, window)), error(*base)

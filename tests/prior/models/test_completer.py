@@ -1,4 +1,5 @@
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.complete.body import frames_since_and_until
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.completer_features import (
     FEATURES,
     SHARE_FRAMES,
     CompleterConfig,
     correction_share,
+    growth,
     read_window,
     solved_rotations,
 )
@@ -27,7 +30,7 @@ from steadypose.prior.models.line import anchored, draw_line
 from steadypose.prior.models.weights import WeightsError
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.loop import TrainingOptions
-from steadypose.training.recipes.completer import Completer, Truth, masks, predict, train_completer
+from steadypose.training.recipes.completer import Completer, Truth, calibrate, masks, predict, train_completer
 from steadypose.training.weights import arrays_of
 
 SMALL = CompleterConfig(width=16, heads=2, layers=2)
@@ -206,6 +209,22 @@ def test_training_ends_the_same_twice(tmp_path: Path, monkeypatch: pytest.Monkey
     motion = MotionSet.load(data, "default", "train")
     truth = Truth.of(motion, motion.all_windows(12, 40)[:2])
     assert np.isfinite(truth.seen(np.ones((2, 12, 22), bool), torch.from_numpy(USUAL)).features).all()
+
+
+def test_calibration_finds_the_errors_and_how_soon_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(_: object, seen: np.ndarray, __: object) -> Mock:
+        """Every hidden joint is 0.1 m off along each axis at the distance of half the error, and 0.2 m far away."""
+        since, until = frames_since_and_until(np.isfinite(seen[..., 0]))
+        with np.errstate(divide="ignore"):
+            off = 0.2 * growth(1.0 / (1.0 / since + 1.0 / until), 5.0)
+        return Mock(positions=true[0] + off[..., None])
+
+    motion = MotionSet.load(prepared(tmp_path / "m.npz"), "default", "val")
+    true = motion.positions[motion.all_windows(74, 5)[:1]].double().numpy()
+    monkeypatch.setattr("steadypose.training.recipes.completer.complete", late)
+    config = calibrate(network(), motion, windows=1)
+    assert config.half_frames == 5.0
+    assert np.allclose(config.far_sigma, 0.2, atol=1e-3)
 
 
 def test_the_weights_that_ship_fill_a_gap_better_than_a_line() -> None:
