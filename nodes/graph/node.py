@@ -202,9 +202,12 @@ class Node(ABC):
             self.report()
 
     def _addresses(self) -> Iterator[list[str]]:
-        """Publishers' addresses, one list per subscriber. Each client has its own, so that none starves another."""
+        """Publishers' addresses, one list per subscriber. Each client has its own, so that none starves another. A
+        node that wants only diagnostics of the input, for its timeline, does not hear clients: each has another
+        timeline, and what one sends amiss is not this node's problem.
+        """
         nodes, clients = NODES[self.name].subscribes, self.launch.server.clients
-        if "pose_input" in nodes:
+        if {*nodes.get("pose_input", ())} - {DIAGNOSTICS}:
             yield from ([address] for address in clients)
         others = [address for node in nodes for address in self.launch.addresses(node) if address not in clients]
         if others:

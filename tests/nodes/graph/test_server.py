@@ -62,6 +62,7 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
             return len(answers) == 2 and all(len(found) >= FRAMES - 6 for found in answers.values())
 
         until(answered)
+        assert door.subscribers == {"prior"}, "what a client says of itself is no matter of the trajectory's"
     assert prior.status()["streams"] == "2"
     for name, bodies in (("door", 1), ("desk", 2)):
         captured = {round(m.stamp_ns / 1e6) for m in streams[name]}
