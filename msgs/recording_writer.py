@@ -119,7 +119,7 @@ class RecordingWriter(Closing):
         payload = encode(message)
         if (topic, payload) in self._tail:
             return
-        if self._part.broken or self._is_full(topic, stamp_ns):
+        if self._part.broken or self._part.closed or self._is_full(topic, stamp_ns):
             self.split()
         self._part.write(topic, payload, stamp_ns)
 
@@ -138,9 +138,11 @@ class RecordingWriter(Closing):
         self._part.sync()
 
     def split(self) -> None:
-        """Complete this part, and start the next."""
+        """Complete this part, and start the next. If it raises OSError, as on a full disk, it can be called again."""
         self._finish()
-        self._part = _Part(self.directory, self._part.number + 1)
+        following = _Part(self.directory, self._part.number + 1)
+        self._done.append(self._part.info)
+        self._part = following
 
     def _is_full(self, topic: str, stamp_ns: int) -> bool:
         info = self._part.info
@@ -157,25 +159,26 @@ class RecordingWriter(Closing):
 
     def _finish(self) -> None:
         """Complete this part, remove the oldest parts beyond the limit, and write the metadata."""
-        self._part.close()
-        self._done.append(self._part.info)
-        sizes = {info.path: info.path.stat().st_size for info in self._done}
-        while self._keep_bytes and len(self._done) > 1 and sum(sizes.values()) > self._keep_bytes:
-            oldest = self._done.pop(0)
-            oldest.path.unlink()
-            del sizes[oldest.path]
-        self._write_metadata()
+        if not self._part.closed:
+            self._part.close()
+        # somebody may have removed some to make room
+        parts = [info for info in (*self._done, self._part.info) if info.path.exists()]
+        sizes = [info.path.stat().st_size for info in parts]
+        while self._keep_bytes and len(parts) > 1 and sum(sizes) > self._keep_bytes:
+            parts.pop(0).path.unlink()
+            del sizes[0]
+        self._write_metadata(parts)
 
-    def _write_metadata(self) -> None:
+    def _write_metadata(self, parts: list[PartInfo]) -> None:
         from ruamel.yaml import YAML  # slow to import, and needed only for recording
 
-        counts = sum((info.counts for info in self._done), Counter[str]())
-        first_ns = min(info.first_ns for info in self._done)
-        last_ns = max(info.last_ns for info in self._done)
+        counts = sum((info.counts for info in parts), Counter[str]())
+        first_ns = min((info.first_ns for info in parts), default=0)
+        last_ns = max((info.last_ns for info in parts), default=0)
         information = {
             "version": 8,
             "storage_identifier": "mcap",
-            "relative_file_paths": [info.path.name for info in self._done],
+            "relative_file_paths": [info.path.name for info in parts],
             **_span(first_ns, last_ns, counts),
             "topics_with_message_count": [
                 {
@@ -193,9 +196,7 @@ class RecordingWriter(Closing):
             ],
             "compression_format": "",
             "compression_mode": "",
-            "files": [
-                {"path": info.path.name, **_span(info.first_ns, info.last_ns, info.counts)} for info in self._done
-            ],
+            "files": [{"path": info.path.name, **_span(info.first_ns, info.last_ns, info.counts)} for info in parts],
             "custom_data": None,
             "ros_distro": "",
         }
@@ -224,7 +225,12 @@ class _Part:
         self._written: dict[str, int] = {}
         self._flushed: dict[str, int] = {}
         self._pending = 0
-        self.flush()
+        try:
+            self.flush()
+        except OSError:
+            self.close()
+            self.info.path.unlink()  # the next attempt makes it again
+            raise
 
     @property
     def closed(self) -> bool:

@@ -480,3 +480,29 @@ def test_a_full_disk_keeps_what_was_written_and_the_next_part_comes_when_there_i
     found = read(directory)
     assert len(found) > len(everything) - 60
     assert found[-1].stamp_ns == max(recorded.stamp_ns for recorded in everything)
+
+
+@pytest.mark.parametrize("limits", [{"split_bytes": 50_000}, {"split_ns": 5 * 10**8}])
+def test_a_disk_that_is_full_between_two_parts(limits: dict[str, Any], tmp_path: Path):
+    directory, everything = tmp_path / "recording", stream()
+    with RecordingWriter(directory, **limits) as writer:
+        for index, (topic, stamp_ns, message) in enumerate(everything):
+            if index % 100 == 0:
+                (directory / "metadata.yaml.tmp").symlink_to("/dev/full")
+            elif index % 100 == 50:
+                (directory / "metadata.yaml.tmp").unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                writer.write(topic, message, stamp_ns)
+    with AnyReader([directory]) as bag:
+        assert bag.message_count == len(read(directory)) > len(everything) // 2
+
+
+def test_parts_that_somebody_removes_to_make_room_are_not_missed(tmp_path: Path):
+    directory = tmp_path / "recording"
+    with RecordingWriter(directory, split_bytes=50_000, keep_bytes=10**9) as writer:
+        for topic, stamp_ns, message in stream():
+            (directory / "recording_1.mcap").unlink(missing_ok=True)
+            writer.write(topic, message, stamp_ns)
+    assert len(list(directory.glob("*.mcap"))) > 2
+    with AnyReader([directory]) as bag:
+        assert bag.message_count == len(read(directory))
