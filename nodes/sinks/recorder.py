@@ -28,6 +28,8 @@ from steadypose.prior.settings import nearest
 
 logger = logging.getLogger(__name__)
 
+LEAST_FREE_MB = 1.0
+"""Smallest free disk space in which messages are written: a part's header may fit where its messages do not."""
 CHECK_NS = 1_000_000_000
 """Interval between checks of the free disk space, nanoseconds."""
 QUIET_S = 0.3
@@ -48,7 +50,7 @@ class RecorderSettings:
     keep_mb: float = 0.0
     """total size above which the oldest parts are removed, MB; 0: keep all"""
     free_mb: float = 500.0
-    """free disk space below which messages are dropped and counted, MB"""
+    """free disk space below which messages are dropped and counted, MB; at least 1"""
     sync_s: float = 5.0
     """interval of writing to the disk, which limits what a power failure can lose, seconds; 0: left to the operating
     system"""
@@ -230,13 +232,14 @@ class RecorderNode(Node):
             return
         self._checked_ns = now
         try:
-            free = shutil.disk_usage(self._writer.directory).free
-            if free < self._settings.free_mb * 1e6:
-                self._no_room(f"{free / 1e6:.0f} MB are free, less than free_mb = {self._settings.free_mb:g}")
+            free_mb = shutil.disk_usage(self._writer.directory).free / 1e6
+            least_mb = max(self._settings.free_mb, LEAST_FREE_MB)
+            if free_mb < least_mb:
+                self._no_room(f"{free_mb:.1f} MB of the disk are free, less than {least_mb:g} (free_mb)")
             elif self._full:
-                logger.info("recorder: the disk has room again; the next part starts")
                 self._writer.split()
                 self._full = False
+                logger.info("recorder: the disk has room again; the next part starts")
             elif self._settings.sync_s and now - self._synced_ns >= self._settings.sync_s * 1e9:
                 self._synced_ns = now
                 self._writer.sync()

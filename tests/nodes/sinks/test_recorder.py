@@ -22,13 +22,19 @@ def free(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return usage
 
 
+@pytest.mark.parametrize(("free_mb", "left"), [(500.0, 10**7), (0.0, 10**5)])
 def test_messages_are_dropped_while_there_is_no_room_and_recorded_again_when_there_is(
-    tmp_path: Path, make_launch: Callable[..., Launch], clock: VirtualClock, free: SimpleNamespace
+    tmp_path: Path,
+    make_launch: Callable[..., Launch],
+    clock: VirtualClock,
+    free: SimpleNamespace,
+    free_mb: float,
+    left: int,
 ) -> None:
-    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out", recorder__free_mb=free_mb), clock)
     node._writer = node._settings.writer()
     for index, frame in enumerate(walk(90)):
-        free.free = 10**7 if 30 <= index < 60 else 10**12
+        free.free = left if 30 <= index < 60 else 10**12
         clock.time_ns += 1_100_000_000
         node.handle(POSE_RAW, frame)
     node._writer.close()
