@@ -157,8 +157,8 @@ def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
         yield warning(
             "few_joints",
-            f"only {usual} joints of a body are seen, the others are NaN: expected {MIN_JOINTS} or more; get the whole "
-            "body into the image, or lower the tracker's own threshold",
+            f"only {usual} of a body's joints are seen, the others are NaN: expected {MIN_JOINTS} or more; get the "
+            "whole body into the image, or lower the tracker's own threshold",
         )
 
 

@@ -119,13 +119,14 @@ def check_wire(refused: Counter[str]) -> Iterator[Problem]:
     if second := refused[SECOND]:
         yield error(
             "second_publisher",
-            f"{second} messages came from a second publisher with the same source name, and were refused: "
+            f"messages of a second publisher with the same source name were refused ({second}): "
             "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
             "one of the two",
         )
     if invalid := {cause: count for cause, count in refused.items() if cause != SECOND}:
+        counts = ", ".join(f"{cause}: {invalid[cause]}" for cause in sorted(invalid))
         yield error(
             "not_a_message",
-            f"{sum(invalid.values())} frames were not valid messages ({', '.join(sorted(invalid))}): expected the "
-            "topic, a zero byte, a header of 17 bytes, and CDR (docs/other_languages.md)",
+            f"frames are no valid messages ({counts}): expected the topic, a zero byte, a header of 17 bytes, "
+            "and CDR (docs/other_languages.md)",
         )

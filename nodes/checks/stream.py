@@ -111,7 +111,7 @@ class StreamCheck:
             return []
         if live and (silent_ns := now_ns - max(last.at_ns, self._heard_ns)) > SILENT_NS:
             text = (
-                f"no message for {silent_ns / 1e9:.0f} s, after {self._window.received} messages: the tracker has "
+                f"no message for {silent_ns / 1e9:.0f} s, after message {self._window.received}: the tracker has "
                 "stopped, hangs, or lost its connection; restart it, and the stream continues"
             )
             return [error("stopped", text)]

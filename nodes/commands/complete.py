@@ -113,11 +113,14 @@ def complete(
     people = len({stretch.body for stretch, _ in completion.done})
     longest = max(done.span for _, done in completion.done) / FPS
     terminal.print(
-        f"{out}: {len(completion.clean) - 1} frames of {plural(people, 'body', 'bodies')}; {completion.given:.0%} of "
-        f"their joints were given, the rest completed; the longest gap was {longest:.1f} s"
+        f"{out}: {plural(len(completion.clean) - 1, 'frame', 'frames')} of {plural(people, 'body', 'bodies')}; "
+        f"{completion.given:.0%} of their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
     if completion.unreached:
-        terminal.print(f"  left unknown, too far from any observation: {completion.unreached} joints", style="yellow")
+        terminal.print(
+            f"  left unknown, too far from any observation: {plural(completion.unreached, 'joint', 'joints')}",
+            style="yellow",
+        )
     for body in completion.centred:
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for other in alternatives.values():

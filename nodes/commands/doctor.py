@@ -116,8 +116,8 @@ def listen(launch_file: str, console: Console) -> int:
         problems.append(
             error(
                 "not_a_message",
-                f"{refused} frames were not valid messages: expected the topic, a zero byte, a header of 17 bytes, and "
-                "CDR (docs/other_languages.md)",
+                f"nothing that came is a valid message ({refused} refused): expected the topic, a zero byte, a header "
+                "of 17 bytes, and CDR (docs/other_languages.md)",
             )
         )
     elif not frames:
@@ -138,8 +138,8 @@ def listen(launch_file: str, console: Console) -> int:
         rate = len(frames) / (LISTEN_NS / 1e9)
         bodies = max(len(raw.bodies) for raw in frames)
         console.print(
-            f"{len(frames)} messages, {rate:.1f} Hz, of {newest.source!r}: skeleton {newest.skeleton!r}, up to "
-            f"{bodies} bodies, frame {newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
+            f"{newest.source!r}: {rate:.1f} Hz, skeleton {newest.skeleton!r}, bodies: {bodies}, frame "
+            f"{newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
         )
     if problems or reported:
         return 1

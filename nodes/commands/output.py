@@ -49,7 +49,7 @@ OTHER_FORMATS = {
 def print_refused(terminal: Console, refused: Mapping[str, int]) -> None:
     """Print in one line what was not used as given, by cause."""
     if refused:
-        counts = ", ".join(f"{count} {cause.replace('_', ' ')}" for cause, count in refused.items())
+        counts = ", ".join(f"{cause.replace('_', ' ')} ({count})" for cause, count in refused.items())
         terminal.print(f"  not used as given: {counts}")
 
 

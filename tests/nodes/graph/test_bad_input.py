@@ -146,7 +146,7 @@ def test_clean_counts_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[
     with np.load(tmp_path / "out.npz") as out:
         assert len(out["stamp_ns"]) == len(frames)
         assert np.isfinite(out["positions"][-1]).all()
-    assert f"not used as given: {SPOILT} unknown skeleton\n" in capsys.readouterr().err
+    assert f"not used as given: unknown skeleton ({SPOILT})\n" in capsys.readouterr().err
 
 
 ONE_BAD_FRAME: dict[str, Spoil] = {
