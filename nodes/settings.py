@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import field, fields, is_dataclass
+from dataclasses import Field, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +53,24 @@ def resolve_paths(settings: type, table: dict[str, Any], folder: Path) -> None:
     """
     for setting in fields(settings):
         value = table.get(setting.name)
-        is_path = _PATH in setting.metadata or (MODEL in setting.metadata and str(value).endswith(".safetensors"))
-        if is_path and isinstance(value, str) and value:
+        if isinstance(value, str) and value and _is_path(setting, value):
             table[setting.name] = str(located(value, folder, setting.metadata.get(_PATH, "")))
         elif isinstance(section := setting.default_factory, type) and is_dataclass(section) and isinstance(value, dict):
             resolve_paths(section, value, folder)
+
+
+def paths_in(settings: Any) -> Iterator[Path]:
+    """All paths in the values of a settings dataclass."""
+    for setting in fields(settings):
+        value = getattr(settings, setting.name)
+        if is_dataclass(value):
+            yield from paths_in(value)
+        elif isinstance(value, str) and value and _is_path(setting, value):
+            yield Path(value)
+
+
+def _is_path(setting: Field[Any], value: str) -> bool:
+    return _PATH in setting.metadata or (MODEL in setting.metadata and value.endswith(".safetensors"))
 
 
 def check_addresses(setting: str, addresses: list[str]) -> None:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,12 +21,14 @@ from rich.console import Console
 
 from steadypose.nodes.graph.launch import Launch, find
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import LaunchError, paths_in
 from steadypose.nodes.sinks.recorder import RecorderSettings
 
 MARK = "# made by `steadypose install-service`; `steadypose install-service --uninstall` removes it"
 HOMES = ("/home", "/root", "/run/user")
 """what ``ProtectHome`` hides"""
+TEMPORARY = ("/tmp", "/var/tmp")
+"""what ``PrivateTmp`` hides"""
 UNIT = """\
 {mark}
 [Unit]
@@ -133,11 +135,6 @@ class Service:
                     "(python3 -m venv /opt/steadypose, then /opt/steadypose/bin/pip install PATH/TO/CHECKOUT), or "
                     "give the user whose home it is with --user"
                 )
-        if self.is_new_user and _is_in(Path(self.launch), HOMES):
-            raise LaunchError(
-                f"{self.launch} is in a home, which a service's own user cannot read: copy it, and what it names, to "
-                f"/etc/{self.name}"
-            )
         recording = launch.settings(RecorderSettings).directory if "recorder" in launch.nodes else ""
         state = _state(self.name)
         if recording and not _is_in(Path(recording), (str(state),)):
@@ -148,6 +145,14 @@ class Service:
             raise LaunchError(
                 f"[transport] directory is {launch.transport.directory}: expected none, or one in /run/{self.name}"
             )
+        sections = [launch, *(section for section in launch.sections.values() if is_dataclass(section))]
+        for path in (Path(self.launch), *(path for section in sections for path in paths_in(section))):
+            for folders, where in ((HOMES, "a home"), (TEMPORARY, "a folder of temporary files")):
+                if (folders is TEMPORARY or self.is_new_user) and _is_in(path, folders):
+                    raise LaunchError(
+                        f"{path} is in {where}, which the service does not see: copy the launch file, and what it "
+                        f"names, to /etc/{self.name}"
+                    )
 
 
 def _is_in(path: Path, folders: tuple[str, ...]) -> bool:

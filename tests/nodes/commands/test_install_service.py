@@ -53,7 +53,10 @@ def test_words_are_systemds() -> None:
             {},
             "in a home.*/opt/steadypose.*pip install PATH/TO/CHECKOUT",
         ),
-        ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy it"),
+        ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
+        ({"launch": "/tmp/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
+        ({}, {"transport.keys": "/root/keys"}, "/root/keys is in a home"),
+        ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
         ({"name": "../x"}, {}, "--name: expected small letters"),
         ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
         ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory .*/run/poses"),
@@ -69,7 +72,7 @@ def test_what_a_service_could_not_do_is_said_beforehand(
 
 def test_a_user_may_run_what_lies_in_his_home() -> None:
     own = service(is_new_user=False, user="a", command=Path("/home/a/bin/steadypose"), launch="/home/a/my.toml")
-    own.check(Launch.read("replay"))
+    own.check(Launch.read("replay", ["transport.keys=/home/a/keys"]))
     assert "ProtectHome=read-only" in own.unit()
 
 
