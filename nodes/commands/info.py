@@ -64,10 +64,10 @@ def info(
     for endpoint in endpoints_of(target, launch, endpoints):
         with subscribe(target, launch, (endpoint,)) as subscriber:
             contents = _listen(subscriber)
-        times = contents.times
-        published |= bool(times)
-        print(f"  {endpoint}: {plural(len(times), 'message', 'messages')} in {INFO_S:g} s{Rate(times).brief}")
-        if times:
+        published |= bool(contents.messages)
+        messages = plural(contents.messages, "message", "messages")
+        print(f"  {endpoint}: {messages} in {INFO_S:g} s{Rate(contents.times).brief}")
+        if contents.messages:
             print(f"    {contents}")
     if not published:
         print("nobody publishes it there: is `steadypose run` running?")
@@ -78,15 +78,19 @@ class _Contents:
     """What messages speak of, and when they came, in seconds."""
 
     def __init__(self) -> None:
-        self.times: list[float] = []
+        self.messages = 0
+        self.times: list[float] = []  # without the end of a stream, which repeats the last frame's
         self._names: dict[str, dict[str, None]] = {}
         self._bodies: set[int] = set()
 
     def add(self, message: Message, time_s: float) -> None:
-        self.times.append(time_s)
+        self.messages += 1
         if isinstance(message, Diagnostics):
+            self.times.append(time_s)
             self._note("nodes", message.node)
             return
+        if not message.end_of_stream:
+            self.times.append(time_s)
         self._note("source", message.source)
         self._note("frame", message.frame_id)
         if isinstance(message, PoseRaw):
@@ -126,9 +130,9 @@ def _describe_recording(path: Path) -> Iterator[str]:
             where = plural(recording.gaps, "place", "places")
             yield f"damaged: {recording.lost_bytes} bytes in {where} cannot be read; `steadypose repair` saves the rest"
         for topic in recording.topics:
-            rate = Rate(contents[topic].times)
+            messages = plural(contents[topic].messages, "message", "messages")
             yield f"{topic}: {wire_type(TOPICS[topic])}"
-            yield f"    {plural(rate.count, 'message', 'messages')}{rate.brief}"
+            yield f"    {messages}{Rate(contents[topic].times).brief}"
             yield f"    {contents[topic]}"
         for topic, count in recording.refused.items():
             yield f"{topic}: {plural(count, 'message', 'messages')} that cannot be decoded"

@@ -242,7 +242,8 @@ def hz(
     if target not in TOPICS:
         stamps: dict[str, list[float]] = {}
         for topic, message in messages_of(target, topics, launch, endpoints):
-            stamps.setdefault(topic, []).append(message.stamp_ns / 1e9)
+            if isinstance(message, Diagnostics) or not message.end_of_stream:  # the end repeats the last stamp
+                stamps.setdefault(topic, []).append(message.stamp_ns / 1e9)
         for topic, found in stamps.items():
             print(f"{topic}: {Rate(found[:count])}")
         return
@@ -278,6 +279,8 @@ class Rate:
         return f", {self.mean_hz:.2f} Hz, longest gap {self.longest_s * 1e3:.0f} ms"
 
     def __str__(self) -> str:
+        if np.isnan(self.mean_hz):
+            return f"no rate, window: {self.count}"
         return (
             f"average rate: {self.mean_hz:.3f} Hz  min: {self.shortest_s:.4f} s  max: {self.longest_s:.4f} s  "
             f"std dev: {self.deviation_s:.5f} s  window: {self.count}"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import record, walk
 from ruamel.yaml import YAML
 from tests.helpers.synthetic_poses import messages
 
@@ -16,6 +17,7 @@ from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, Pose
 from steadypose.nodes.commands import info as info_module
 from steadypose.nodes.commands.info import info
 from steadypose.nodes.commands.inspect import InspectError, Rate, echo, hz, measure
+from steadypose.nodes.sources.recording import end_of
 
 DEADLINE_S = 20.0
 
@@ -99,6 +101,18 @@ def test_echo_of_a_topic_counts_to_its_end(tmp_path: Path, capsys: pytest.Captur
 def test_hz_of_a_recording_is_that_of_its_stamps(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     hz(str(recording), topics=(POSE_RAW,))
     assert "average rate: 30.000 Hz  min: 0.0333 s  max: 0.0333 s" in capsys.readouterr().out
+
+
+def test_the_end_of_a_stream_is_no_frame_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, frames in (("one", walk(1)), ("two", walk(2))):
+        record(tmp_path / name, [*frames, end_of(frames[-1])])
+        assert info(str(tmp_path / name)) == 0
+        hz(str(tmp_path / name))
+    said = capsys.readouterr().out
+    assert "2 messages\n" in said
+    assert "pose/raw: no rate, window: 1\n" in said
+    assert "3 messages, 30.00 Hz, longest gap 33 ms\n" in said
+    assert "pose/raw: average rate: 30.000 Hz" in said
 
 
 def test_hz_of_a_topic_ends_after_its_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
