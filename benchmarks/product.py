@@ -21,6 +21,7 @@ from steadypose.prior.clean.settings import (
     PriorSettings,
     RefineSettings,
     ScoreSettings,
+    SteadySettings,
 )
 
 PRODUCT: Mapping[str, PriorSettings] = {
@@ -31,6 +32,7 @@ PRODUCT: Mapping[str, PriorSettings] = {
         refine=RefineSettings(enabled=True),
         fuse=FuseSettings(enabled=False),
         posture=PostureSettings(enabled=False),
+        steady=SteadySettings(enabled=False),
         orient=OrientSettings(enabled=False),
     ),
     "steadypose": PriorSettings(),

@@ -47,6 +47,7 @@ from steadypose.prior.clean.settings import (
     PriorSettings,
     RefineSettings,
     ScoreSettings,
+    SteadySettings,
 )
 from steadypose.prior.models.mixture import inference
 from steadypose.prior.world.pipeline import TrajectoryPipeline
@@ -85,6 +86,7 @@ PARTS: Mapping[str, Part] = {
     "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
     "without fusion": Part(PriorSettings(fuse=FuseSettings(enabled=False))),
     "without the posture": Part(PriorSettings(posture=PostureSettings(enabled=False))),
+    "without the steady stage": Part(PriorSettings(steady=SteadySettings(enabled=False))),
     "without orientations by the whole body": Part(PriorSettings(orient=OrientSettings(enabled=False))),
     "with HM-VAE, which is off": Part(PriorSettings(refine=RefineSettings(enabled=True))),
 }

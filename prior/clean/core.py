@@ -23,6 +23,7 @@ from steadypose.prior.clean.rotations import Orient, Refine
 from steadypose.prior.clean.score import Scorer
 from steadypose.prior.clean.sensor_error import Correct, DepthError
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.clean.steady import Steady
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
@@ -75,11 +76,12 @@ class CleanCore:
         self._imputes = impute
         self.fuse = Fuse(settings.fuse, slots)
         self._posture = Posture(settings.posture) if settings.posture.enabled else None
+        self._steady = Steady(slots) if settings.steady.enabled else None
         self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         stages = (
             self._gate, self._correct, self._history, self._smooth, self._denoise, self._bias, self._depth_error,
-            self._person, self._score, self._refine, self.fuse, self._orient,
+            self._person, self._score, self._refine, self.fuse, self._steady, self._orient,
         )  # fmt: skip
         self._stages = [stage for stage in stages if stage is not None]
         self._newest: _Newest | None = None
@@ -181,6 +183,8 @@ class CleanCore:
         if self._posture:
             noise = np.hypot(newest.gated.jitter, newest.bias.bias_sigma)
             estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
+        if self._steady:
+            estimate = self._steady.update(estimate, smoothed.step)
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         mixed = mix(estimate, self._history.unseen_s[at])
         if self._orient:

@@ -154,6 +154,14 @@ class PostureSettings:
 
 
 @dataclass(frozen=True)
+class SteadySettings:
+    """Settings of the steady stage."""
+
+    enabled: bool = True
+    """whether revisions take a few frames; if off, observed joints stay as they are estimated"""
+
+
+@dataclass(frozen=True)
 class OrientSettings:
     """Settings of the orient stage."""
 
@@ -176,8 +184,8 @@ class PriorSettings:
         bias_sigma: metres along an axis, expected standard deviation of the sensor's bias. It is the prior of the bias
             that is estimated from the stream, and a fault must exceed it. Depth cameras have 2 cm or more.
         identify: settings of the identify stage, which assigns body ids instead of the source (off by default).
-        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, posture, orient: settings of
-            the stages.
+        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, posture, steady, orient:
+            settings of the stages.
     """
 
     delay: int = 4
@@ -196,6 +204,7 @@ class PriorSettings:
     refine: RefineSettings = field(default_factory=RefineSettings)
     fuse: FuseSettings = field(default_factory=FuseSettings)
     posture: PostureSettings = field(default_factory=PostureSettings)
+    steady: SteadySettings = field(default_factory=SteadySettings)
     orient: OrientSettings = field(default_factory=OrientSettings)
 
     def __post_init__(self) -> None:

@@ -24,6 +24,8 @@ class Smoothed(NamedTuple):
     """(..., 3) metres; NaN for a joint that has not been observed yet"""
     sigma: Floats
     """(...) metres, standard deviation along an axis; inf where positions are NaN"""
+    step: Floats | None = None
+    """(..., 3) metres, motion to the next frame, estimated from the same observations; None without a later frame"""
 
 
 class ConstantVelocityFilter:

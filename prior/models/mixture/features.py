@@ -102,7 +102,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
     weights, noise = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     for s in range(bodies):
         total, seen_joints = 0.0, 0.0
-        _write_experts(
+        write_experts(
             bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
             bank.observations[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness[s], experts[s],
             weights, noise,
@@ -153,7 +153,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
 
 
 @njit(cache=True)
-def _write_experts(
+def write_experts(
     tracks, modes, squared_innovations, log_variances, observations, raw, unseen, shared, experts, weights, noise
 ):
     """Write the joints' experts (J, EXPERTS, 3), and the tracks' smoother weights (J, M) and noise (J,).

@@ -31,7 +31,9 @@ from steadypose.prior.models.mixture.features import (
     OUTPUTS,
     PARENT,
     REACH,
+    SHARED,
     describe,
+    write_experts,
 )
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.models.mixture.whiteness import Whiteness, fallback
@@ -115,11 +117,15 @@ class MixtureSmoother:
         describe(bank, self._count, back, PARENT, self.white, *described)
         share = fallback(self.white, self._scale, self.delay)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
+        following = np.full_like(places, np.nan)
         for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
             outputs = _outputs(self._features[slot], self._net, self._memory, slot)
             frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], share[slot]
             _mixed(outputs, self._experts[slot], *frame, places[slot], sigma[slot])
-        return Smoothed(self._stamps[-1 - back], places, sigma)
+            if back:
+                _write_next(bank, slot, self._count, back, self.white[slot], self._experts[slot])
+                _mixed(outputs, self._experts[slot], *frame, following[slot], np.empty(22))
+        return Smoothed(self._stamps[-1 - back], places, sigma, following - places if back else None)
 
 
 class _Network(NamedTuple):
@@ -262,6 +268,17 @@ def _concatenated(a, b, c):
         for k in range(c.shape[1]):
             out[i, a.shape[1] + b.shape[1] + k] = c[i, k]
     return out
+
+
+@njit(cache=True)
+def _write_next(bank, s, count, back, whiteness, experts):
+    """Write a body's experts (J, EXPERTS, 3) in the frame after the one ``back`` frames before the newest."""
+    slot, joints = (count - back) % bank.position.shape[3], len(experts)
+    write_experts(
+        bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
+        bank.observations[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness, experts,
+        np.empty((joints, len(DENSITIES))), np.empty(joints),
+    )  # fmt: skip
 
 
 @njit(cache=True)
