@@ -1,5 +1,6 @@
 import itertools
 import os
+import re
 import signal
 import socket
 from collections.abc import Callable, Iterator
@@ -167,6 +168,54 @@ def test_an_input_that_is_killed_goes_on_where_it_was(start: Any, tmp_path: Path
     assert stamps == sorted(set(stamps[:-1])) + stamps[-1:], "none twice, none back, but for the mark of the end"
     assert len(stamps) == 151, "not one went with the process"
     assert stamps[-1] == frames[-1].stamp_ns
+
+
+CAMERA = """
+import itertools, os
+import numpy as np
+from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.nodes.sources.source import LiveSource
+
+class Camera(LiveSource):
+    def __init__(self, clock):
+        super().__init__()
+        self.clock = clock
+
+    def frames(self):  # of which each says whose it is, and its number
+        for number in itertools.count():
+            self.clock.sleep(10**9 // 100)
+            body = RawBody(number, np.zeros((22, 3)), np.ones(22))
+            yield PoseRaw(self.clock.now_ns(), str(os.getpid()), "camera", "smpl22", Pose.identity(), True, [body])
+
+    def status(self):
+        return {}
+
+def open_camera(options, context):
+    return Camera(context.clock)
+"""
+
+
+def test_a_camera_whose_process_is_killed(start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "acme.py").write_text(CAMERA)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    out = tmp_path / "out/out_0.mcap"
+    run: Run = start(
+        "--record", str(tmp_path / "out"), *INPUT_ALONE, "--set", "recorder.free_mb=0",
+        "--set", "transport.lossless=false", "--set", "input.source=acme:open_camera",
+    )  # fmt: skip
+    until(lambda: poses_recorded(tmp_path / "out"), timeout_s=60)
+    run.kill("pose_input")
+    size = out.stat().st_size
+    until(lambda: out.stat().st_size > 2 * size, timeout_s=60)
+    _, output = run.end()
+    with RecordingReader(tmp_path / "out") as reader:
+        frames = [m for _, _, m in reader.messages([POSE_RAW]) if isinstance(m, PoseRaw) and m.bodies]
+    first, second = ([m.bodies[0].id for m in of] for _, of in itertools.groupby(frames, lambda m: m.frame_id))
+    assert second[0] < first[-1] / 2, "heard at once, not after as many frames as before"
+    row = re.search(r"pose_input +ended +(\d+) +([\d.]+)", output)
+    assert row, output
+    assert len(frames) <= int(row[1]) <= len(frames) + first[-1] / 2, "each frame is counted once"
+    assert 20.0 < float(row[2]) <= 100.0, "the rate is of its own frames in its own time"
 
 
 def test_systemd_is_told_when_all_are_ready_and_that_they_live(
