@@ -211,6 +211,8 @@ class PriorSettings:
         check_range("[prior] delay", self.delay, 0, MAX_DELAY)
         check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # benchmarks run 256 bodies together
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
+        check_range("[prior] bias_sigma", self.bias_sigma, 0.0, 1.0)
+        check_range("[prior.gate] min_confidence", self.gate.min_confidence, 0.0, 1.0)
         check_range("[prior.person] samples", self.person.samples, 1, 1e6)
         check_range("[prior.person] every", self.person.every, 1, 1e6)
         for section in (f.name for f in fields(self) if is_dataclass(getattr(self, f.name))):

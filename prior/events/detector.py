@@ -83,7 +83,14 @@ class EventSettings:
         check_range("[events] confidence", self.confidence, 0.5, 0.999)
         for setting in fields(self):
             if setting.name != "confidence":
-                check_range(f"[events] {setting.name}", getattr(self, setting.name), 0.0, 60.0)
+                most = math.pi if setting.name in _ANGLES else 60.0
+                check_range(f"[events] {setting.name}", getattr(self, setting.name), 0.0, most)
+
+
+_ANGLES = frozenset(
+    {"faces", "faces_margin", "sits", "sits_margin", "wave_swing", "point_elbow", "point_elbow_margin", "point_lift"}
+)
+"""Settings in radians."""
 
 
 NOWHERE: NDArray[np.float64] = np.zeros(3)

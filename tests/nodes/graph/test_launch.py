@@ -93,6 +93,9 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya', did you mean 'delay'"),
         ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup', did you mean 'jump'"),
         ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
+        ("[prior]\nbias_sigma = 20", "bias_sigma: expected 0 to 1, got 20"),
+        ("[prior.gate]\nmin_confidence = 50", "min_confidence: expected 0 to 1, got 50"),
+        ("[events]\nfaces = 30", "faces: expected 0 to 3.14159, got 30"),
         ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok', did you mean 'network'"),
     ],
 )
