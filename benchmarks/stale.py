@@ -4,20 +4,16 @@ _STEADY = "measured before the steady stage, which moves observed joints by a sh
 
 STALE: dict[str, str] = dict.fromkeys(
     (
-        "ablations",
         "contacts",
         "counter",
         "event_mocap",
         "events",
-        "fidelity",
         "heading",
         "hidden_joints",
         "humor",
         "kinect_vicon",
         "latency",
         "layouts",
-        "mediapipe",
-        "noisy_joints",
         "restart",
         "retarget",
         "rotations",
