@@ -8,7 +8,6 @@ STALE: dict[str, str] = dict.fromkeys(
         "counter",
         "event_mocap",
         "events",
-        "heading",
         "humor",
         "kinect_vicon",
         "latency",
