@@ -5,9 +5,6 @@ _STEADY = "measured before the steady stage, which moves observed joints by a sh
 STALE: dict[str, str] = dict.fromkeys(
     (
         "contacts",
-        "counter",
-        "event_mocap",
-        "events",
         "humor",
         "kinect_vicon",
         "latency",
