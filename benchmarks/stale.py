@@ -9,7 +9,6 @@ STALE: dict[str, str] = dict.fromkeys(
         "kinect_vicon",
         "latency",
         "restart",
-        "retarget",
         "rotations",
         "scale",
         "soak",
