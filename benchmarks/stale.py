@@ -4,10 +4,8 @@ _STEADY = "measured before the steady stage, which moves observed joints by a sh
 
 STALE: dict[str, str] = dict.fromkeys(
     (
-        "contacts",
         "humor",
         "kinect_vicon",
-        "latency",
         "restart",
         "rotations",
         "scale",
