@@ -55,7 +55,7 @@ def test_words_are_systemds() -> None:
         ),
         ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
         ({"launch": "/tmp/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
-        ({}, {"transport.keys": "/root/keys"}, "/root/keys is in a home"),
+        ({}, {"transport.keys": "/home/a/keys"}, "/home/a/keys is in a home"),
         ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
         ({"name": "../x"}, {}, "--name: expected small letters"),
         ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
