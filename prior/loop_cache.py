@@ -26,11 +26,13 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+from numba.core.extending import _Intrinsic
+
 from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 152
+LOOPS = 154
 """Number of entries that the nodes need with the default settings."""
 COMPLETE = "complete"
 """Name of a file beside the entries: the digest of the sources for which all entries exist."""
@@ -234,7 +236,9 @@ def _parts(function: FunctionType, loop: object) -> Iterator[str]:
         named = [function.__globals__[name] for name in code.co_names if name in function.__globals__]
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
         for value in (*constants, *code.co_names, *named, *cells):
-            if value is not loop:
+            if isinstance(value, _Intrinsic):  # writes instructions itself
+                yield from _parts(value._defn, loop)
+            elif value is not loop:
                 yield digest(value) if hasattr(value, "py_func") else _text(value)
 
 

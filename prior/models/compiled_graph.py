@@ -3,9 +3,8 @@
 In torch, overhead dominates networks of this size: 250 small operations take ten times as long as their arithmetic.
 Here, a network is recorded once as a list of steps (`Program`), and compiled loops run it (`Network`).
 
-Each step processes one window after the other. A window's matrices of 66 nodes fit into the L1 cache, where a product
-takes half as long per window as for eight windows side by side, and the step's weights are still cached for the next
-window. The results of a window therefore do not depend on other windows, bit for bit.
+Each step processes one window after the other: a window's matrices of 66 nodes fit into the L1 cache, and the step's
+weights are still cached for the next window. The results of a window do not depend on other windows, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.matmul import multiply
 from steadypose.prior.models.weights import Arrays, part
 
 LOG_VAR_RANGE = (-10.0, 3.0)
@@ -25,10 +25,6 @@ LOG_VAR_RANGE = (-10.0, 3.0)
 _LINEAR, _GELU = range(2)
 _FIELDS = 8
 _NONE = -1
-
-_SMALL = 1_000_000
-"""Largest number of products in a matrix multiplication for which OpenBLAS does not repack the matrices. Repacking
-takes three times as long as the multiplication itself if there are only ten rows."""
 
 _LINE = 16
 """Number of floats in a cache line. Matrices are aligned to it; unaligned products take a seventh longer."""
@@ -121,7 +117,8 @@ class Network:
         self._weights = _zeros(sum(map(len, program.weights)))
         np.concatenate(program.weights, out=self._weights)
         self._values = _zeros(max_batch, self._starts[-1])
-        self._scratch = _zeros(3, -(-self._shapes.max(axis=0).prod() // _LINE) * _LINE)
+        nodes, features = self._shapes.max(axis=0)
+        self._scratch, self._nothing = _zeros(3, -(-nodes * features // _LINE) * _LINE), _zeros(features)
 
     def matrix(self, number: int, rows: slice) -> Floats32:
         """(B, n, f) view of one matrix of the windows in these rows."""
@@ -129,7 +126,9 @@ class Network:
 
     def run(self, rows: slice) -> None:
         """Run all steps for the windows in these rows."""
-        _forward(self._steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch)
+        _forward(
+            self._steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch, self._nothing
+        )
 
 
 def _zeros(*shape: int) -> Floats32:
@@ -192,30 +191,15 @@ def _mix_first(nodes_in, features_in, nodes, features):
 
 
 @njit(cache=True)
-def _multiply(a, weight, product):
-    """Write ``a @ weight``, in parts small enough for BLAS kernels that do not repack matrices."""
-    rows, inner = a.shape
-    parts = -(-rows * inner * weight.shape[1] // _SMALL)
-    if parts == 1:
-        np.dot(a, weight, product)
-        return
-    width = -(-inner // parts)
-    product[:] = 0
-    for first in range(0, inner, width):
-        part = np.dot(np.ascontiguousarray(a[:, first : first + width]), weight[first : first + width])
-        _add(part.ravel(), _ONE, product.ravel())
-
-
-@njit(cache=True)
-def _forward(steps, shapes, starts, weights, windows, scratch):
+def _forward(steps, shapes, starts, weights, windows, scratch, nothing):
     """Run the steps for windows (B, all matrices)."""
     for k in range(len(steps)):
         for row in range(len(windows)):
-            _do(steps[k], shapes, starts, weights, windows[row], scratch)
+            _do(steps[k], shapes, starts, weights, windows[row], scratch, nothing)
 
 
 @njit(cache=True)
-def _do(step, shapes, starts, weights, values, scratch):
+def _do(step, shapes, starts, weights, values, scratch, nothing):
     out, a = _view(values, shapes, starts, step[1]), _view(values, shapes, starts, step[2])
     nodes, features = out.shape
     nodes_in, features_in = a.shape
@@ -226,19 +210,22 @@ def _do(step, shapes, starts, weights, values, scratch):
             _gelu(a.ravel(), activated.ravel())
             a = activated
         weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
-        product = scratch[2, : out.size].reshape(out.shape)
+        shift, product = (
+            weights[of_bias : of_bias + out.size].reshape(out.shape),
+            scratch[2, : out.size].reshape(out.shape),
+        )
         if of_adjacency == _NONE:
-            _multiply(a, weight, product)
+            multiply(a, weight, shift, product)
         else:
             adjacency = weights[of_adjacency : of_adjacency + nodes * nodes_in].reshape(nodes, nodes_in)
             if _mix_first(nodes_in, features_in, nodes, features):
                 mixed = scratch[1, : nodes * features_in].reshape(nodes, features_in)
-                _multiply(np.dot(adjacency, a, mixed), weight, product)
+                multiply(adjacency, a, nothing[:features_in].reshape(1, -1), mixed)
+                multiply(mixed, weight, shift, product)
             else:
                 weighed = scratch[1, : nodes_in * features].reshape(nodes_in, features)
-                _multiply(a, weight, weighed)
-                np.dot(adjacency, weighed, product)
-        _add(weights[of_bias : of_bias + out.size], _ONE, product.ravel())
+                multiply(a, weight, nothing[:features].reshape(1, -1), weighed)
+                multiply(adjacency, weighed, shift, product)
         if plus != _NONE:
             _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())
         _copy(product.ravel(), out.ravel())

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba.core import event
+from llvmlite import ir
+from numba.core import event, types
+from numba.extending import intrinsic
 
 from steadypose.prior import loop_cache
 from steadypose.prior.compiled import njit
@@ -102,6 +104,21 @@ def test_it_is_compiled_anew_when_anything_that_it_is_made_of_changes(monkeypatc
     inner = njit(cache=True)(add)
     assert digest(add) != first[0]
     assert digest(calls) != first[1]
+
+
+def test_it_is_compiled_anew_when_instructions_that_it_writes_itself_change() -> None:
+    def digest(constant: int) -> str:
+        @intrinsic
+        def write(_: Any) -> Any:
+            return types.intp(), lambda context, builder, signature, arguments: ir.IntType(64)(constant)
+
+        def calls():
+            return write()  # pyright: ignore[reportCallIssue]
+
+        return loop_cache.digest(njit(cache=True)(calls))
+
+    assert digest(1) == digest(1)
+    assert digest(1) != digest(2)
 
 
 def test_where_nothing_can_be_written_it_is_said_once_and_all_works(tmp_path: Path, folder: Path, caplog) -> None:

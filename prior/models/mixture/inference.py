@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.matmul import multiply
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
@@ -118,8 +119,10 @@ class MixtureSmoother:
         share = fallback(self.white, self._scale, self.delay)
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         following = np.full_like(places, np.nan)
-        for slot in np.flatnonzero((self._gap >= 0).any(axis=1)):
-            outputs = _outputs(self._features[slot], self._net, self._memory, slot)
+        slots = np.flatnonzero((self._gap >= 0).any(axis=1))
+        _write_outputs(slots, self._features, self._net, self._memory)
+        for slot in slots:
+            outputs = self._memory.written[slot]
             frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], share[slot]
             _mixed(outputs, self._experts[slot], *frame, places[slot], sigma[slot])
             if back:
@@ -188,54 +191,68 @@ def _network(name: str) -> _Network:
 
 
 @njit(cache=True)
-def _outputs(features, net, memory, slot):
-    """Run `MixtureNet` for one body and frame: (22, OUTPUTS) from features (22, FEATURES)."""
-    joints, zero, one = len(features), np.float32(0), np.float32(1)
-    started = memory.body_weight[slot, 0] > zero
-    normalised = np.empty_like(features)
-    for j in range(joints):
-        for k in range(FEATURES):
-            normalised[j, k] = (features[j, k] - net.mean[k]) * net.per_deviation[k]
-    own = np.dot(normalised, net.read)
-    _rectify(own, net.joint, own)
+def _write_outputs(slots, features, net, memory):
+    """Run `MixtureNet` for a frame of the bodies in these slots: write `_Memory.written` from features (S, 22,
+    FEATURES).
+
+    Layers of the whole body, whose weights fill a cache, are run for all bodies at once; others body by body.
+    """
+    count, joints, zero, one = len(slots), features.shape[1], np.float32(0), np.float32(1)
+    normalised = np.empty((count, joints, FEATURES), dtype=np.float32)
+    own = np.empty((count, joints, len(net.own_decay)), dtype=np.float32)
     own_before = np.empty_like(own)
-    _remember(own, net.own_decay, memory.own[slot], memory.own_weight[slot], own_before)
-    body, summand = np.dot(own.reshape(1, -1), net.gather), np.empty_like(net.gather_bias)
-    _rectify(body, net.gather_bias, body)
-    lasting = np.empty_like(body)
-    _remember(body, net.body_decay, memory.body[slot : slot + 1], memory.body_weight[slot : slot + 1], lasting)
-    np.dot(lasting, net.remember, summand)
-    _rectify(summand, net.remember_bias, summand)
-    _add(summand, body)
-    np.dot(body, net.think, summand)
-    _rectify(summand, net.think_bias, summand)
-    _add(summand, body)
-    context = np.dot(body, net.tell).reshape(joints, -1)
-    _add(net.tell_bias, context)
-    mixed = np.dot(_concatenated(normalised, own_before, context), net.mix)
-    _rectify(mixed, net.joint_mix, mixed)
-    deeper = np.dot(mixed, net.deepen)
-    _rectify(deeper, net.deepen_bias, deeper)
-    _add(deeper, mixed)
-    new, written = np.dot(mixed, net.write), memory.written[slot]
-    _add(net.write_bias, new)
-    for j in range(joints):
-        for k in range(OUTPUTS):
-            gate = OUTPUTS if k < 2 * EXPERTS else OUTPUTS + 1 if k < OUTPUTS - 1 else OUTPUTS + 2
-            leaning = one / (one + np.exp(-new[j, gate])) if started else zero
-            written[j, k] = leaning * written[j, k] + (one - leaning) * new[j, k]
-    return written
+    for b in range(count):
+        slot = slots[b]
+        for j in range(joints):
+            for k in range(FEATURES):
+                normalised[b, j, k] = (features[slot, j, k] - net.mean[k]) * net.per_deviation[k]
+        multiply(normalised[b], net.read, net.joint, own[b])
+        _rectify(own[b])
+        _remember(own[b], net.own_decay, memory.own[slot], memory.own_weight[slot], own_before[b])
+    body = np.empty((count, len(net.body_decay)), dtype=np.float32)
+    lasting, summand = np.empty_like(body), np.empty_like(body)
+    multiply(own.reshape(count, -1), net.gather, net.gather_bias, body)
+    _rectify(body)
+    started = np.empty(count, dtype=np.bool_)
+    for b in range(count):
+        slot, row = slots[b], slice(b, b + 1)
+        at = slice(slot, slot + 1)
+        started[b] = memory.body_weight[slot, 0] > zero
+        _remember(body[row], net.body_decay, memory.body[at], memory.body_weight[at], lasting[row])
+    for of, weight, bias in ((lasting, net.remember, net.remember_bias), (body, net.think, net.think_bias)):
+        multiply(of, weight, bias, summand)
+        _rectify(summand)
+        _add(summand, body)
+    context = np.empty((count, net.tell_bias.size), dtype=np.float32)
+    multiply(body, net.tell, net.tell_bias.reshape(1, -1), context)
+    mixed, new = np.empty((joints, net.mix.shape[1]), dtype=np.float32), np.empty_like(net.write_bias)
+    deeper = np.empty_like(mixed)
+    for b in range(count):
+        multiply(
+            _concatenated(normalised[b], own_before[b], context[b].reshape(joints, -1)), net.mix, net.joint_mix, mixed
+        )
+        _rectify(mixed)
+        multiply(mixed, net.deepen, net.deepen_bias, deeper)
+        _rectify(deeper)
+        _add(deeper, mixed)
+        multiply(mixed, net.write, net.write_bias, new)
+        written = memory.written[slots[b]]
+        for j in range(joints):
+            for k in range(OUTPUTS):
+                gate = OUTPUTS if k < 2 * EXPERTS else OUTPUTS + 1 if k < OUTPUTS - 1 else OUTPUTS + 2
+                leaning = one / (one + np.exp(-new[j, gate])) if started[b] else zero
+                written[j, k] = leaning * written[j, k] + (one - leaning) * new[j, k]
 
 
 # Loops instead of array expressions, because numba takes a second or two to compile each broadcast expression.
 
 
 @njit(cache=True)
-def _rectify(values, bias, out):
-    """Write ``max(values + bias, 0)``, all (N, F)."""
+def _rectify(values):
+    """Replace negative values (N, F) by 0."""
     for i in range(len(values)):
         for k in range(values.shape[1]):
-            out[i, k] = max(values[i, k] + bias[i, k], np.float32(0))
+            values[i, k] = max(values[i, k], np.float32(0))
 
 
 @njit(cache=True)

@@ -1,0 +1,37 @@
+"""Products of small matrices: as numpy has them, and each row alone as among others."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from steadypose.prior.models.matmul import multiply
+
+
+def matrices(rows: int, inner: int, columns: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    shapes = (rows, inner), (inner, columns), (rows, columns)
+    a, weight, shift = (rng.standard_normal(shape).astype(np.float32) for shape in shapes)
+    return a, weight, shift
+
+
+def product(a: np.ndarray, weight: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    written = np.full((len(a), weight.shape[1]), np.nan, dtype=np.float32)
+    multiply(a, weight, shift, written)
+    return written
+
+
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 150), st.booleans(), st.integers(0, 99))
+def test_it_is_the_product_of_numpy(rows: int, inner: int, columns: int, one_shift: bool, seed: int) -> None:
+    a, weight, shift = matrices(rows, inner, columns, seed)
+    shift = shift[:1] if one_shift else shift
+    np.testing.assert_allclose(product(a, weight, shift), shift + a.astype(float) @ weight, atol=2e-4)
+
+
+@pytest.mark.parametrize("rows", [2, 5, 6, 7, 13])
+def test_a_row_does_not_depend_on_the_others(rows: int) -> None:
+    a, weight, shift = matrices(rows, 300, 80, 0)
+    together = product(a, weight, shift)
+    for row in range(rows):
+        alone = product(a[row : row + 1], weight, shift[row : row + 1])
+        np.testing.assert_array_equal(alone[0], together[row])
