@@ -49,6 +49,8 @@ CLIENTS = (1, 4, 8, 16)
 LIVE_CLIENTS = (1, 4, 8, 16, 32)
 NETWORK_NS = 3_000_000
 """Network latency of a message, nanoseconds."""
+LAST_S = 1.0
+"""Time after the messages that count in which they may be answered, seconds."""
 PERIOD_MS = FRAME_NS / 1e6
 
 
@@ -116,16 +118,19 @@ def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str,
             if not publisher.wait_for_subscribers({"prior"}, timeout_s=START_S):
                 raise RuntimeError(f"expected the prior within {START_S:g} s, and it did not come")
         began_ns = nodes.clock.now_ns()
-        for period in range(round((WARM_UP_S + seconds) * FPS)):
+        counted = range(round(WARM_UP_S * FPS), round((WARM_UP_S + seconds) * FPS))
+        # between two clients' stamps
+        first_ns, end_ns = (began_ns + (k - 0.5 / clients) * FRAME_NS for k in (counted.start, counted.stop))
+        for period in range(counted.stop + round(LAST_S * FPS)):
             raw = next(stream)
             for k, publisher in enumerate(publishers):
                 stamp_ns = began_ns + round((period + k / clients) * FRAME_NS)
                 nodes.clock.sleep(stamp_ns - nodes.clock.now_ns())
                 if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # otherwise this process is too slow to be a client
                     publisher.publish(POSE_RAW, dataclasses.replace(raw, source=names[k], stamp_ns=stamp_ns))
-                    sent += period >= WARM_UP_S * FPS
+                    sent += first_ns <= stamp_ns < end_ns
             while received := nodes.subscriber.receive(0):
-                if period >= WARM_UP_S * FPS and received[0] == POSE_WORLD:
+                if received[0] == POSE_WORLD and first_ns <= received[1].stamp_ns < end_ns:
                     late_ms.append((nodes.clock.now_ns() - received[1].stamp_ns - delay_ns) / 1e6)
                     answered += bool(getattr(received[1], "bodies", ()))
     return {"clients": clients, "sent": sent, "answered": answered, "latency_ms": percentiles(late_ms or [np.nan])}

@@ -17,7 +17,7 @@ import numpy as np
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.models.completer_features import rotations_of_6d
-from steadypose.prior.models.layers import dense, leaky_relu, mix_edges, pool_matrix, pooling_levels, unpool_matrix
+from steadypose.prior.models.layers import Dense, leaky_relu, mix_edges, pool_matrix, pooling_levels, unpool_matrix
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
 ROTATION_FEATURES = 6
@@ -182,12 +182,16 @@ class _TemporalLinear:
         for k, tap in enumerate(tap_of.ravel()):
             merged[:, tap] += weight[..., k]
         self._over_time = np.ascontiguousarray(taps.reshape(-1, taps.shape[-1]))
-        self._weight, self._bias = merged.reshape(len(merged), -1), bias
+        self._dense, self._inputs, self._outputs = (
+            Dense(merged.reshape(len(merged), -1), bias),
+            merged[0].size,
+            len(merged),
+        )
 
     def __call__(self, x: Floats32) -> Floats32:
         """Map (B, T, in) to (B, T', out)."""
-        windows = (self._over_time @ x).reshape(-1, self._weight.shape[1])
-        return dense(windows, self._weight, self._bias).reshape(len(x), -1, len(self._weight))
+        windows = (self._over_time @ x).reshape(-1, self._inputs)
+        return self._dense(windows).reshape(len(x), -1, self._outputs)
 
 
 class _Latent:
@@ -212,11 +216,10 @@ class _Affine:
         basis = np.eye(1 + size, size, k=-1, dtype=np.float32).reshape(-1, edges, latent)
         zero, *rows = function(basis)
         self._shape = zero.shape
-        self._weight = np.ascontiguousarray((np.stack(rows) - zero).reshape(size, -1).T)
-        self._bias = zero.ravel()
+        self._dense = Dense((np.stack(rows) - zero).reshape(size, -1).T, zero.ravel())
 
     def __call__(self, latent: Floats32) -> Floats32:
-        return dense(latent, self._weight, self._bias).reshape(-1, *self._shape)
+        return self._dense(latent).reshape(-1, *self._shape)
 
 
 def _unpooled(weight: Floats32, unpool: Floats32) -> Floats32:

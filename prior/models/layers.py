@@ -13,11 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats32
-from steadypose.prior.compiled import njit
+from steadypose.prior.models.matmul import multiply
 from steadypose.prior.models.weights import Arrays
-
-FEW_ROWS = 2
-"""Largest number of rows for which products without BLAS take half the time; BLAS copies the weights first."""
 
 SLOPE = 0.2
 """Slope of the LeakyReLU for negative values."""
@@ -26,24 +23,17 @@ BLOCKS, NEAR = 4, 2
 """Number of HM-VAE's blocks, and distance within which edges are mixed by a convolution over the skeleton, edges."""
 
 
-def dense(x: Floats32, weight: Floats32, bias: Floats32) -> Floats32:
-    """``x @ weight.T + bias``: (N, in) to (N, out)."""
-    if len(x) > FEW_ROWS:
-        return np.ascontiguousarray((weight @ x.T).T) + bias
-    out = np.empty((len(x), len(weight)), dtype=np.float32)
-    _few_rows(np.ascontiguousarray(x), weight, out)
-    return out + bias
+class Dense:
+    """A linear layer of ``weight`` (out, in) and ``bias`` (out) or (1), from (N, in) to (N, out)."""
 
+    def __init__(self, weight: Floats32, bias: Floats32) -> None:
+        self._weight = np.ascontiguousarray(weight.T, dtype=np.float32)
+        self._bias = np.full((1, len(weight)), bias, dtype=np.float32)
 
-@njit("(f4[:,::1], f4[:,::1], f4[:,::1])", cache=True, fastmath=True)
-def _few_rows(x, weight, out):
-    """Write ``x @ weight.T``: (N, in) and (M, in) to (N, M)."""
-    for j in range(len(weight)):
-        for i in range(len(x)):
-            total = np.float32(0)
-            for k in range(x.shape[1]):
-                total += x[i, k] * weight[j, k]
-            out[i, j] = total
+    def __call__(self, x: Floats32) -> Floats32:
+        out = np.empty((len(x), self._weight.shape[1]), dtype=np.float32)
+        multiply(np.ascontiguousarray(x, dtype=np.float32), self._weight, self._bias, out)
+        return out
 
 
 def leaky_relu(x: Floats32) -> Floats32:
@@ -58,18 +48,18 @@ class LiveRecurrent:
     """
 
     def __init__(self, weights: Arrays, unit: str) -> None:
-        self._input = weights[f"{unit}.weight_ih_l0"], weights[f"{unit}.bias_ih_l0"]
-        self._kept = weights[f"{unit}.weight_hh_l0"], weights[f"{unit}.bias_hh_l0"]
-        self._head = weights["head.weight"], weights["head.bias"]
+        self._input = Dense(weights[f"{unit}.weight_ih_l0"], weights[f"{unit}.bias_ih_l0"])
+        self._kept = Dense(weights[f"{unit}.weight_hh_l0"], weights[f"{unit}.bias_hh_l0"])
+        self._head = Dense(weights["head.weight"], weights["head.bias"])
         self.hidden = weights["head.weight"].shape[1]
 
     def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> tuple[Floats32, Floats32]:
         """Return the head's outputs (B, O) for one frame's features (B, F), and the next hidden state (B, `hidden`)."""
-        reset_in, update_in, new_in = np.split(dense(features, *self._input), 3, axis=-1)
-        reset_kept, update_kept, new_kept = np.split(dense(state, *self._kept), 3, axis=-1)
+        reset_in, update_in, new_in = np.split(self._input(features), 3, axis=-1)
+        reset_kept, update_kept, new_kept = np.split(self._kept(state), 3, axis=-1)
         new = np.tanh(new_in + sigmoid(reset_in + reset_kept) * new_kept)
         state = new + sigmoid(update_in + update_kept) * (state - new)
-        return dense(state, *self._head), state
+        return self._head(state), state
 
 
 def sigmoid(x: Floats32) -> Floats32:

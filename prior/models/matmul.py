@@ -37,6 +37,9 @@ def _tile(rows: int, vectors: int) -> Any:
 
     @intrinsic
     def write(_: Any, a: Any, weight: Any, shift: Any, product: Any, row: Any, column: Any) -> Any:
+        if any((each.dtype, each.ndim, each.layout) != (types.float32, 2, "C") for each in (a, weight, shift, product)):
+            return None  # numba then raises a TypingError
+
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             arrays = [
                 context.make_array(kind)(context, builder, value)
@@ -82,15 +85,20 @@ _row_wide, _row_narrow = _tile(1, _WIDE), _tile(1, 1)
 @njit(cache=True)
 def multiply(a, weight, shift, product):
     """Write ``shift + a @ weight``, of float32 matrices in C order, to ``product``, which must not overlap them.
-    ``shift`` has one row, or as many as ``product``.
+    ``shift`` has one row, or as many as ``product``. Matrices that do not fit raise a ValueError.
     """
-    if product.shape[1] >= _LANES:
+    rows, columns = product.shape
+    if (len(a), weight.shape[1]) != (rows, columns) or a.shape[1] != len(weight):
+        raise ValueError("multiply: expected a product of as many rows as its first matrix and columns as its second")
+    if shift.shape[1] != columns or len(shift) not in (1, rows):
+        raise ValueError("multiply: expected a shift of one row or of the product's, and of its columns")
+    if columns >= _LANES:
         _multiply_wide(a, weight, shift, product)
         return
-    whole = np.empty((len(product), _LANES), dtype=np.float32)
+    whole = np.empty((rows, _LANES), dtype=np.float32)
     _multiply_wide(a, _widened(weight), _widened(shift), whole)
-    for row in range(len(product)):
-        for column in range(product.shape[1]):
+    for row in range(rows):
+        for column in range(columns):
             product[row, column] = whole[row, column]
 
 

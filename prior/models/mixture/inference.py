@@ -120,7 +120,8 @@ class MixtureSmoother:
         places, sigma = np.full((self._slots, 22, 3), np.nan), np.full((self._slots, 22), np.inf)
         following = np.full_like(places, np.nan)
         slots = np.flatnonzero((self._gap >= 0).any(axis=1))
-        _write_outputs(slots, self._features, self._net, self._memory)
+        if len(slots):
+            _write_outputs(slots, self._features, self._net, self._memory)
         for slot in slots:
             outputs = self._memory.written[slot]
             frame = bank.heading[slot], self._scale[slot], self._gap[slot], self._between[slot], share[slot]
