@@ -54,14 +54,11 @@ LAST_S = 1.0
 PERIOD_MS = FRAME_NS / 1e6
 
 
-def serve(
-    frames: list[PoseRaw], clients: int, hgvae: bool, periods: int, track: Callable[..., Iterable[int]]
-) -> dict[str, Any]:
+def serve(frames: list[PoseRaw], clients: int, periods: int, track: Callable[..., Iterable[int]]) -> dict[str, Any]:
     """Measure the milliseconds per 30 Hz period, of ``periods``, that the prior and the trajectories of these clients
-    take; with ``hgvae``, windows are scored and hidden joints imputed.
+    take.
     """
-    switched = {stage: {"enabled": hgvae} for stage in ("score", "impute")}
-    prior = StreamBatch(PriorSettings.from_dict({"max_bodies": clients} | switched), clients)
+    prior = StreamBatch(PriorSettings(max_bodies=clients), clients)
     trajectories = [TrajectoryPipeline(TrajectorySettings()) for _ in range(clients)]
     names = [f"client {k}" for k in range(clients)]
     spent: dict[str, list[float]] = {"prior": [], "trajectory": []}
@@ -85,7 +82,6 @@ def serve(
                 samples.append(cost[node])
     return {
         "clients": clients,
-        "hgvae": hgvae,
         "periods": periods,
         "answered": answers / (clients * (periods + WARM_UP)),
         "refused": {cause: n for cause, n in prior.counters.items() if n},
@@ -109,8 +105,6 @@ def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str,
         settings = [
             f"server.clients={json.dumps([publisher.endpoint for publisher in publishers])}",
             f"prior.max_bodies={clients}",
-            "prior.score.enabled=false",
-            "prior.impute.enabled=false",
             "transport.lossless=false",
         ]
         nodes = stack.enter_context(running_nodes(["prior", "trajectory"], settings))
@@ -150,7 +144,7 @@ def run(bench: Bench) -> Result:
     """Measure streams per core, and recordings cleaned per hour, on this machine."""
     periods = round((2.0 if bench.quick else 10.0) * 30)
     frames = recorded()[:600]
-    served = [serve(frames, clients, on, periods, bench.progress.track) for clients in CLIENTS for on in (False, True)]
+    served = [serve(frames, clients, periods, bench.progress.track) for clients in CLIENTS]
     lived = [serve_live(frames, clients, periods / 30) for clients in LIVE_CLIENTS]
     cleaned = clean_rate(RECORDING)
     numpy = round(numpy_ms(), 3)
@@ -161,11 +155,10 @@ def run(bench: Bench) -> Result:
 def _streams_a_core(served: list[dict[str, Any]]) -> dict[str, int]:
     """Return the largest measured number of clients that a node serves on one core: 99 of 100 periods end in time."""
 
-    def most(node: str, hgvae: bool) -> int:
-        in_time = (s["clients"] for s in served if s["hgvae"] == hgvae and s[f"{node}_ms"]["p99"] < PERIOD_MS)
-        return max(in_time, default=0)
-
-    return {"prior": most("prior", True), "prior without": most("prior", False), "trajectory": most("trajectory", True)}
+    return {
+        node: max((s["clients"] for s in served if s[f"{node}_ms"]["p99"] < PERIOD_MS), default=0)
+        for node in ("prior", "trajectory")
+    }
 
 
 def _live_table(lived: list[dict[str, Any]]) -> Table:
@@ -180,7 +173,7 @@ def _live_table(lived: list[dict[str, Any]]) -> Table:
     return Table.of(
         "scale_live", "A server's clients, from capture to pose/world at 30 Hz, less the delay, ms", clients,
         {"clients": "{clients}", **LATENCIES, "answered, %": "{share:.1f}", "in time": "{timely}"},
-        "One body a client, score and imputation off. Answered: a client's messages that came back with its body. "
+        "One body a client. Answered: a client's messages that came back with its body. "
         f"In time: a p99 of {LATEST_MS:g} ms, for what is answered.",
     )  # fmt: skip
 
@@ -188,18 +181,16 @@ def _live_table(lived: list[dict[str, Any]]) -> Table:
 def _table(served: list[dict[str, Any]], cleaned: dict[str, float], numpy: float) -> Table:
     most = _streams_a_core(served)
     periods = [
-        {**s, "networks": "on" if s["hgvae"] else "off", "share": s["prior_ms"]["p50"] / s["clients"],
-         "ratio": s["prior_ms"]["p50"] / s["clients"] / numpy}
+        {**s, "share": s["prior_ms"]["p50"] / s["clients"], "ratio": s["prior_ms"]["p50"] / s["clients"] / numpy}
         for s in served
-    ]  # fmt: skip
+    ]
     return Table.of(
         "scale", "A server's processor time a period of 33.3 ms, ms", periods,
-        {"clients": "{clients}", "score, impute": "{networks}", "prior, p50": "{prior_ms[p50]:.1f}",
+        {"clients": "{clients}", "prior, p50": "{prior_ms[p50]:.1f}",
          "prior, p99": "{prior_ms[p99]:.1f}", "a client": "{share:.2f}", "of numpy's": "{ratio:.2f}",
          "trajectory, p50": "{trajectory_ms[p50]:.1f}", "p99": "{trajectory_ms[p99]:.1f}"},
         "One body a client. In time 99 of 100 periods, on a core: "
-        f"{most['prior without']} clients for the prior without score and imputation, {most['prior']} with, and "
-        f"{most['trajectory']} for the trajectory, which is not batched. `clean` does {cleaned['rate']:.1f} s of a "
-        f"stream of one body a second and core. A client's is also given in units of 30 steps of a Kalman filter of 44 "
-        f"states in numpy, {numpy:.2f} ms here: what machines differ by.",
+        f"{most['prior']} clients for the prior, and {most['trajectory']} for the trajectory, which is not batched. "
+        f"`clean` does {cleaned['rate']:.1f} s of a stream of one body a second and core. A client's is also given in "
+        f"units of 30 steps of a Kalman filter of 44 states in numpy, {numpy:.2f} ms here: what machines differ by.",
     )  # fmt: skip

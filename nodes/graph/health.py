@@ -12,7 +12,7 @@ import numpy as np
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import Problem, as_values, error
-from steadypose.nodes.graph.clock import Clock
+from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.topology import NODES
 
 REPORT_NS = 1_000_000_000
@@ -133,8 +133,9 @@ class Health:
         values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
         own = self.published - self._inherited
         values |= {
-            f"mean_rate.{topic}": f"{(own[topic] - 1) * 1e9 / max(last - first, 1):.2f}"
+            f"mean_rate.{topic}": f"{(own[topic] - 1) * 1e9 / (last - first):.2f}"
             for topic, (first, last) in self._first_and_last_ns.items()
+            if last - first > FRAME_NS  # messages of one moment have no rate
         }
         values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)
         values |= {key: str(n) for key, n in sorted(counts.items())}

@@ -267,7 +267,7 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
         return int(stamp_ns)
     if isinstance(t, timedelta | np.timedelta64):
         raise FilterError(f"t: expected a number of seconds, got {t!r}; t / np.timedelta64(1, 's')")
-    if not isinstance(t, Real) or not math.isfinite(t) or t < 0:
+    if not isinstance(t, Real) or isinstance(t, bool) or not math.isfinite(t) or t < 0:
         raise FilterError(f"t: expected seconds of 0 or more, got {t!r}")
     if t >= 2**31:
         raise FilterError(f"t: expected seconds, got {t!r}; say stamp_ns= of nanoseconds, divide milliseconds by 1000")

@@ -134,6 +134,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "seconds as a timedelta": (lambda j: Filter()(j[0], timedelta(seconds=1)), "t: expected a number of seconds"),
     "nanoseconds of numpy": (lambda j: Filter()(j[0], stamp_ns=np.timedelta64(1, "ns")), "expected whole nanoseconds"),
+    "true for seconds": (lambda j: Filter()(j[0], True), "t: expected seconds of 0 or more, got True"),
     "seconds as text": (lambda j: Filter()(j[0], "0.1"), "t: expected seconds of 0 or more, got '0.1'"),
     "seconds as nanoseconds": (
         lambda j: Filter()(j[0], stamp_ns=1.7e9 + 0.3),

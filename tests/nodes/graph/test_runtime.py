@@ -207,6 +207,14 @@ def test_a_restarted_node_counts_on_and_its_rates_are_its_own(clock: VirtualCloc
     assert values[f"rate.{POSE_RAW}"] == values[f"mean_rate.{POSE_RAW}"] == "20.00"
 
 
+def test_messages_of_one_moment_have_no_rate(clock: VirtualClock) -> None:
+    health = Health(clock)
+    for _ in range(5):  # as when a recording of one frame ends
+        health.note_published(POSE_CLEAN, clock.time_ns, None)
+        clock.time_ns += 100
+    assert f"mean_rate.{POSE_CLEAN}" not in health.report("prior", Counter(), {}).values
+
+
 HOUR_NS = 3_600_000_000_000
 
 
