@@ -4,11 +4,7 @@ _STEADY = "measured before the steady stage, which moves observed joints by a sh
 
 STALE: dict[str, str] = dict.fromkeys(
     (
-        "humor",
-        "kinect_vicon",
         "restart",
-        "rotations",
-        "scale",
         "soak",
     ),
     _STEADY,
