@@ -28,6 +28,11 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
         [("layouts", "layouts", f"{layout}, all seen: steadypose", "all, mm") for layout in ("coco17", "smpl22")],
     ),
     (
+        "README.md",
+        r"Two cores of a server \(AMD EPYC\) carry (\d+) people",
+        [("latency", "live", "32", "bodies answered")],
+    ),
+    (
         "docs/fit.md",
         r"in 4 cm of noise is (\S+) mm, of `clean` with 8 frames of delay ([\d.]+); of what is hidden below 0.9 m\s"
         r"(\d+) mm, of `clean` (\d+),",
