@@ -26,9 +26,6 @@ _LINEAR, _GELU = range(2)
 _FIELDS = 8
 _NONE = -1
 
-_LINE = 16
-"""Number of floats in a cache line. Matrices are aligned to it; unaligned products take a seventh longer."""
-
 
 class Program:
     """A network as a list of steps, with the shapes of its matrices and all weights. Steps may overwrite matrices."""
@@ -45,10 +42,9 @@ class Program:
         return len(self.shapes) - 1
 
     def _store(self, values: Floats32) -> int:
-        row = np.ascontiguousarray(values, dtype=np.float32).ravel()
-        self.weights.append(np.pad(row, (0, -len(row) % _LINE)))
-        self._used += len(self.weights[-1])
-        return self._used - len(self.weights[-1])
+        self.weights.append(np.ascontiguousarray(values, dtype=np.float32).ravel())
+        self._used += values.size
+        return self._used - values.size
 
     def _step(self, kind: int, out: int, *fields: int) -> int:
         self.steps.append([kind, out, *fields, *[_NONE] * (_FIELDS - 2 - len(fields))])
@@ -111,32 +107,23 @@ class Network:
     def __init__(self, program: Program, max_batch: int) -> None:
         self._steps = np.array(program.steps, dtype=np.int64)
         self._shapes = np.array(program.shapes, dtype=np.int64)
-        sizes = self._shapes.prod(axis=1)
-        self._starts = np.concatenate([[0], np.cumsum(-(-sizes // _LINE) * _LINE)])
-        self._ends = self._starts[:-1] + sizes
-        self._weights = _zeros(sum(map(len, program.weights)))
-        np.concatenate(program.weights, out=self._weights)
-        self._values = _zeros(max_batch, self._starts[-1])
+        self._starts = np.concatenate([[0], np.cumsum(self._shapes.prod(axis=1))])
+        self._weights = np.concatenate(program.weights)
+        self._values = np.zeros((max_batch, self._starts[-1]), dtype=np.float32)
         nodes, features = self._shapes.max(axis=0)
-        self._scratch, self._nothing = _zeros(3, -(-nodes * features // _LINE) * _LINE), _zeros(features)
+        self._scratch = np.empty((3, nodes * features), dtype=np.float32)
+        self._nothing = np.zeros(features, dtype=np.float32)
 
     def matrix(self, number: int, rows: slice) -> Floats32:
         """(B, n, f) view of one matrix of the windows in these rows."""
-        return self._values[rows, self._starts[number] : self._ends[number]].reshape(-1, *self._shapes[number])
+        values = self._values[rows, self._starts[number] : self._starts[number + 1]]
+        return values.reshape(-1, *self._shapes[number])
 
     def run(self, rows: slice) -> None:
         """Run all steps for the windows in these rows."""
         _forward(
             self._steps, self._shapes, self._starts, self._weights, self._values[rows], self._scratch, self._nothing
         )
-
-
-def _zeros(*shape: int) -> Floats32:
-    """Return zeros in memory that is aligned to a cache line."""
-    size = math.prod(shape)
-    room = np.zeros(size + _LINE, dtype=np.float32)
-    first = -(room.ctypes.data // room.itemsize) % _LINE
-    return room[first : first + size].reshape(shape)
 
 
 # ---------------------------------------------------------------------------------------------------------------
