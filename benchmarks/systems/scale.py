@@ -10,7 +10,7 @@ import dataclasses
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,11 @@ from steadypose.benchmarks.systems.latency import (
     percentiles,
     recorded,
 )
-from steadypose.benchmarks.systems.running import START_S, running_nodes
+from steadypose.benchmarks.systems.running import START_S, Running, running_nodes
 from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import PoseRaw
+from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.prior.clean.batch import StreamBatch
@@ -119,15 +119,20 @@ def serve_live(frames: list[PoseRaw], clients: int, seconds: float) -> dict[str,
             raw = next(stream)
             for k, publisher in enumerate(publishers):
                 stamp_ns = began_ns + round((period + k / clients) * FRAME_NS)
-                nodes.clock.sleep(stamp_ns - nodes.clock.now_ns())
+                for topic, message in _received(nodes, stamp_ns):
+                    if topic == POSE_WORLD and first_ns <= message.stamp_ns < end_ns:
+                        late_ms.append((nodes.clock.now_ns() - message.stamp_ns - delay_ns) / 1e6)
+                        answered += bool(getattr(message, "bodies", ()))
                 if nodes.clock.now_ns() - stamp_ns < FRAME_NS:  # otherwise this process is too slow to be a client
                     publisher.publish(POSE_RAW, dataclasses.replace(raw, source=names[k], stamp_ns=stamp_ns))
                     sent += first_ns <= stamp_ns < end_ns
-            while received := nodes.subscriber.receive(0):
-                if received[0] == POSE_WORLD and first_ns <= received[1].stamp_ns < end_ns:
-                    late_ms.append((nodes.clock.now_ns() - received[1].stamp_ns - delay_ns) / 1e6)
-                    answered += bool(getattr(received[1], "bodies", ()))
     return {"clients": clients, "sent": sent, "answered": answered, "latency_ms": percentiles(late_ms or [np.nan])}
+
+
+def _received(nodes: Running, until_ns: int) -> Iterator[tuple[str, Message]]:
+    """Yield what the nodes publish until a time, and at least what is there already."""
+    while received := nodes.subscriber.receive(max(until_ns - nodes.clock.now_ns(), 0) / 1e9):
+        yield received
 
 
 def clean_rate(recording: Path) -> dict[str, float]:

@@ -1,8 +1,9 @@
 """Runs the prior over many streams in batches: each stage processes a frame of all streams together.
 
 Bodies of several cameras share the stages' slots like bodies of one camera. Only the clocks differ: each stream is
-stamped by its own. All streams are therefore resampled to one shared grid. A grid time is processed when every stream
-has reached it, or after `PATIENCE_NS`. A stream that is later misses that frame and delays no other stream.
+stamped by its own. All streams are therefore resampled to one shared grid, whose times are those of the first stream. A
+grid time is processed when every stream has reached it, or after `PATIENCE_NS`. A stream that is later misses that
+frame and delays no other stream.
 
 The offset from a stream's clock to the server's is the minimum of arrival time minus capture stamp: the clock
 difference plus the least network latency. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
@@ -76,6 +77,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         self._streams: dict[str, _Stream] = {}
         self._stamps: dict[str, StampGate] = {}
         self._waiting: dict[int, list[BodyJoints]] = {}
+        self._grid_ns: int | None = None  # a time of the shared grid
         self._done_ns: int | None = None
 
     @property
@@ -139,7 +141,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self._forget(name)
         self._drop(np.ones_like(self._slots.present))
         self._waiting.clear()
-        self._done_ns = None
+        self._grid_ns = self._done_ns = None
         return cleaned
 
     def _is_pose_accepted(self, raw: PoseRaw) -> bool:
@@ -171,8 +173,10 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             if len(self._streams) >= self._max_streams:
                 self.counters["too_many_streams"] += 1
                 return
+            if self._grid_ns is None:
+                self._grid_ns = now_ns
             stream = self._streams[raw.source] = _Stream(
-                resampler=Resampler(self._settings.max_bodies, aligned=True, delayed=self._settings.delay > 0),
+                resampler=Resampler(self._settings.max_bodies, grid_ns=self._grid_ns, delayed=self._settings.delay > 0),
                 identify=self._new_identify(),
                 offset_ns=now_ns - raw.stamp_ns,
                 recent=RecentMessages(),

@@ -71,12 +71,12 @@ class Resampler:
 
     Args:
         slots: largest number of bodies.
-        aligned: whether grid times are whole multiples of the period; otherwise, the grid starts at the first frame.
+        grid_ns: a time of the grid, nanoseconds; if omitted, the grid starts at the first frame.
         delayed: whether the output is delayed anyway; see `DecimationFilter`.
     """
 
-    def __init__(self, slots: int, *, aligned: bool = False, delayed: bool = True) -> None:
-        self._slots, self._aligned, self._delayed = slots, aligned, delayed
+    def __init__(self, slots: int, *, grid_ns: int | None = None, delayed: bool = True) -> None:
+        self._slots, self._grid_ns, self._delayed = slots, grid_ns, delayed
         self.reset()
 
     def reset(self) -> None:
@@ -100,8 +100,8 @@ class Resampler:
         frames that it completes, oldest first. A republished frame is ignored.
         """
         if self._tick_ns is None:
-            first = -(-(stamp_ns - LOOK_AHEAD_NS) // PERIOD_NS) * PERIOD_NS  # rounded up
-            self._tick_ns = first if self._aligned else stamp_ns
+            start_ns = stamp_ns if self._grid_ns is None else self._grid_ns
+            self._tick_ns = start_ns - (start_ns - stamp_ns + LOOK_AHEAD_NS) // PERIOD_NS * PERIOD_NS
         if self._republished.update(positions):
             return []
         return self._gridded(self._decimation.update(Frame(stamp_ns, positions, confidence)))

@@ -116,6 +116,16 @@ def test_each_stream_gets_what_it_would_get_alone(identify: bool) -> None:
                 assert turn.magnitude().max() < turned
 
 
+@pytest.mark.parametrize("phase_ms", [0, 11, 28])
+def test_who_is_alone_waits_for_nobody(phase_ms: int) -> None:
+    arrivals = kiosk("one", 20, phase_ns=phase_ms * 1_000_000)
+    batch = StreamBatch(PriorSettings(delay=2), max_streams=4)
+    for k, (now_ns, message) in enumerate(arrivals):
+        answers = batch.process_at(message, now_ns)
+        assert len(answers) == (k >= 2)
+        assert all(abs(answer.stamp_ns + 2 * PERIOD_NS - message.stamp_ns) <= 1 for answer in answers)
+
+
 def test_frames_at_any_time_and_a_clock_that_drifts() -> None:
     fast = kiosk("fast", 80, phase_ns=12_000_000)
     fast = [(now, dataclasses.replace(m, stamp_ns=m.stamp_ns + round(1e-4 * (now - NOW_NS)))) for now, m in fast]
@@ -244,14 +254,15 @@ def test_nonsense_from_one_is_counted_and_the_others_go_on() -> None:
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 1, 10_000_000, 20_000_000, PERIOD_NS, 7 * PERIOD_NS + 12_345_678])
-def test_an_aligned_grid_begins_at_the_first_multiple_in_reach(stamp_ns: int) -> None:
-    resampler = Resampler(1, aligned=True)
+@pytest.mark.parametrize("grid_ns", [0, 5_000_000_000])
+def test_a_given_grid_begins_at_the_first_of_its_times_in_reach(stamp_ns: int, grid_ns: int) -> None:
+    resampler = Resampler(1, grid_ns=grid_ns)
     ticks = []
     for k in range(3):
         frames = resampler.update(stamp_ns + k * PERIOD_NS, np.zeros((1, 22, 3)), np.ones((1, 22)))
         assert all(np.isfinite(positions).all() for _, positions, _ in frames)
         ticks += [tick for tick, _, _ in frames]
-    assert all(tick % PERIOD_NS == 0 for tick in ticks)
+    assert all((tick - grid_ns) % PERIOD_NS == 0 for tick in ticks)
     assert -10_000_000 <= ticks[0] - stamp_ns < PERIOD_NS - 10_000_000
 
 
