@@ -25,8 +25,8 @@ _ROWS = 6
 """Number of rows in a tile."""
 
 _WIDE = 3 if get_host_cpu_features().get("avx512f") else 1
-"""Number of vectors in a row of a wide tile. Its 18 or 6 vectors, one row of weights and one more fill most of the 32
-registers of 16 floats, or of the 16 registers of 8 floats."""
+"""Number of vectors in a row of a wide tile. Its 18 sums, 3 vectors of weights and one of an element of ``a`` fit into
+32 registers of 16 floats; 6 sums, in two registers each, fit into 16 registers of 8 floats."""
 
 
 def _tile(rows: int, vectors: int) -> Any:
@@ -37,6 +37,7 @@ def _tile(rows: int, vectors: int) -> Any:
 
     @intrinsic
     def write(_: Any, a: Any, weight: Any, shift: Any, product: Any, row: Any, column: Any) -> Any:
+        """Write the tile of ``shift + a @ weight`` that begins at ``row`` and ``column``."""
         if any((each.dtype, each.ndim, each.layout) != (types.float32, 2, "C") for each in (a, weight, shift, product)):
             return None  # numba then raises a TypingError
 
@@ -56,6 +57,7 @@ def _tile(rows: int, vectors: int) -> Any:
 
             one_shift = builder.icmp_signed("==", cgutils.unpack_tuple(builder, arrays[2].shape)[0], size(1))
             in_rows = [builder.add(arguments[4], size(r)) for r in range(rows)]
+            # memory for LLVM to keep in registers
             sums = {each: cgutils.alloca_once(builder, vector) for each in tile}
             for r, v in tile:
                 shifted = place(2, builder.select(one_shift, size(0), in_rows[r]), v)
