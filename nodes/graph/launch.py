@@ -66,7 +66,7 @@ class Launch(_EveryLaunch):
         if not self.nodes:
             raise LaunchError(f"nodes: expected one or more of {', '.join(NODES)}, got none")
         for node in self.nodes:
-            if node not in NODES:
+            if node not in [*NODES]:  # a list, because what a file names may be no text, and not hashable
                 raise LaunchError(
                     f"nodes names {node!r}, which is not a node{nearest(node, NODES)}; there are {', '.join(NODES)}"
                 )
@@ -161,13 +161,32 @@ def _layout(table: Mapping[str, Any]) -> type:
 def read_toml(file: Path) -> dict[str, Any]:
     """Read a TOML file. Raises LaunchError if the file cannot be read, or is not TOML."""
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return _parse(file.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise LaunchError(f"{file} is not TOML: {error}") from error
     except RecursionError as error:
         raise LaunchError(f"{file}: {TOO_DEEP}") from error
     except OSError as error:
         raise LaunchError(f"{file} cannot be read: {error.strerror}") from error
+
+
+def _parse(text: str) -> dict[str, Any]:
+    """Parse TOML. Raises ValueError if it is not TOML, or has an integer of more than TOML's 64 bits."""
+    table = tomllib.loads(text)
+    _check_integers("", table)
+    return table
+
+
+def _check_integers(name: str, value: Any) -> None:
+    """Check the integers in a value of TOML: Python's have any length, but beyond 64 bits no float."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _check_integers(f"{name}.{key}".lstrip("."), item)
+    elif isinstance(value, list):
+        for item in value:
+            _check_integers(name, item)
+    elif isinstance(value, int) and value.bit_length() > 63:
+        raise ValueError(f"{name}: expected an integer of at most 64 bits, got one of {value.bit_length()}")
 
 
 def bundled(*parts: str) -> Path:
@@ -208,8 +227,8 @@ def apply_override(table: dict[str, Any], override: str) -> None:
         raise LaunchError(f"expected section.key=value, got {override!r}")
     path = current_key(path.strip())
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = _parse(f"value = {text}")["value"]
+    except ValueError:
         value = text
     except RecursionError as error:
         raise LaunchError(f"{path}: {TOO_DEEP}") from error

@@ -51,8 +51,10 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("input = 3", "expected a section"),
         ("nodes = ['priro']", "did you mean 'prior'"),
         ("nodes = ['prior', 'prior']", "nodes names 'prior' 2 times: expected each node once"),
+        ("nodes = [['prior']]", r"nodes names \['prior'\], which is not a node"),
         ("nodes = []", "nodes: expected one or more of pose_input, prior"),
         ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
+        ("[recorder]\ntopics = [['pose/raw']]", r"topics names \['pose/raw'\], which nobody publishes"),
         ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
         ("[transport.endpoints]\nprior = 7101", "expected an address"),
         (
@@ -61,6 +63,9 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ),
         ("[transport]\nqueue = 0", "queue: expected 1 frame or more, got 0"),
         ("[input]\nrate = nan", "rate: expected a finite number such as 1.0, got nan"),
+        (f"[input]\nrate = 1{400 * '0'}", "input.rate: expected an integer of at most 64 bits, got one of 1329"),
+        (f"[input.calibration]\nsize = [1, 1{400 * '0'}]", "input.calibration.size: expected an integer of at most 64"),
+        (f"[input]\nrate = 1{5000 * '0'}", "is not TOML: Exceeds the limit"),
         ("[input]\nrate = inf", "rate: expected a finite number"),
         ("[input]\nrate = -1.0", r"rate: expected 0 \(as fast as possible\) or more, got -1"),
         ("[input.calibration]\nposition = ['a', 1, 2]", "position: expected each to be a float, got 'a'"),
@@ -102,6 +107,12 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
 def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         Launch.read(write(text))
+
+
+def test_a_number_beyond_toml_is_text_to_an_override(write) -> None:
+    for digits in (400, 5000):
+        with pytest.raises(LaunchError, match=r"\[prior\] delay: expected int such as 4, got '10"):
+            Launch.read(write(""), [f"prior.delay=1{digits * '0'}"])
 
 
 def test_a_missing_file_names_those_there_are() -> None:
