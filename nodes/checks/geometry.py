@@ -227,7 +227,7 @@ def _unit(like: Likeness) -> Problem:
 
 def _far(joints: Floats) -> Iterator[Problem]:
     """The problem of bodies, joints (N, J, 3), of which most joints are too far from the sensor to be used."""
-    away = np.nanmedian(np.abs(joints).max(axis=-1), axis=1)
+    away = medians(np.abs(joints).max(axis=-1), axis=1)
     far = away[np.isfinite(away)] > MAX_DISTANCE
     if far.sum() >= ENOUGH:
         found = error(

@@ -20,6 +20,7 @@ from tests.helpers.synthetic_poses import walker
 from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
+from steadypose.nodes.checks.geometry import check_geometry
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.checks.stream import Answers, StreamCheck
 from steadypose.nodes.graph.clock import Timeline
@@ -426,3 +427,9 @@ def test_whatever_comes_is_survived(raws: list[PoseRaw], skeleton: str | None, l
         check.see(_named(raw, skeleton) if skeleton else raw, START_NS + index * 33_000_000)
     for problem in check.problems(START_NS + SECOND_NS, live=live):
         assert problem.text
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_body_without_joints_among_others_is_no_warning_of_numpys() -> None:
+    missing = joints(lambda it: np.full_like(it, np.nan))
+    assert [*check_geometry([missing(raw, k) if k % 4 == 0 else raw for k, raw in enumerate(walk())])] == []
