@@ -95,7 +95,9 @@ def _main(arguments: list[str]) -> int:
     except Exception as error:
         if (told := told_of(error)) is None:
             raise
-        print(f"steadypose {name}: {told}", file=sys.stderr)
+        from steadypose.nodes.commands.output import printable  # imports numpy
+
+        print(f"steadypose {name}: {printable(told)}", file=sys.stderr)
         return USAGE_ERROR
     return status if isinstance(status, int) else 0
 

@@ -59,6 +59,7 @@ def test_help_explains_upgrading_uninstalling_and_each_command(capsys, monkeypat
         (["xyzzy"], "there are run, node"),
         (["run", "nolaunch"], "no launch file 'nolaunch'"),
         (["run", "--input", "nowhere"], "does not exist"),
+        (["run", "--input", "no\x1b[2J\nwhere"], r"no\x1b[2J\x0awhere does not exist"),
         (["run", "--set", "input.rat=3"], "did you mean 'input.rate'"),
         (["node", "priro"], "did you mean 'prior'"),
     ],
