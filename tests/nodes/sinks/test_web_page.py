@@ -87,6 +87,29 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
     assert pixels(page, BACKGROUND) > 100_000
 
 
+def test_bodies_of_all_clients_of_a_server_are_drawn_under_their_names_until_their_stream_ends(
+    server: WebServer, opened: Any
+) -> None:
+    page = opened("/")
+    page.evaluate(
+        """() => {
+          globalThis.labels = [];
+          CanvasRenderingContext2D.prototype.clearRect = () => { globalThis.labels = []; };
+          CanvasRenderingContext2D.prototype.fillText = (text) => { globalThis.labels.push(text); };
+        }"""
+    )
+    last = worlds()[-1]
+    for source in ("Küche 1", "厨房"):
+        send(server, f"{POSE_WORLD}/{source}", dataclasses.replace(last, source=source))
+    names = [f"{source} {body.id}" for source in ("Küche 1", "厨房") for body in last.bodies]
+    until(lambda: sorted(page.evaluate("globalThis.labels")) == sorted(names), timeout_s=SOON_S)
+    send(server, POSE_EVENTS, dataclasses.replace(told(EventKind.HAND_RAISED, Phase.BEGINS, body=1), source="厨房"))
+    until(lambda: page.text_content("#events") == "厨房 1: hand raised", timeout_s=SOON_S)
+    send(server, f"{POSE_WORLD}/厨房", dataclasses.replace(last, source="厨房", bodies=[], end_of_stream=True))
+    until(lambda: page.evaluate("globalThis.labels") == [f"{body.id}" for body in last.bodies], timeout_s=SOON_S)
+    assert page.text_content("#notice") == ""
+
+
 def test_the_last_poses_stay_when_the_stream_has_ended_and_the_server_with_it(browser: Any) -> None:
     server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test", hello())
     page = browser.new_page(viewport={"width": 1000, "height": 600})

@@ -11,8 +11,9 @@ const canvas = document.getElementById("canvas");
 const notice = document.getElementById("notice");
 const pen = canvas.getContext("2d");
 const eye = { yaw: -0.9, pitch: 0.25, distance: 2.6, zoom: 1, target: [0, 0, 0.9] };
+const worlds = new Map(); // the newest poses by source: a server's clients come in turn, and number bodies each from 1
+const doing = new Map(); // by source, then by body
 let world = null;
-let doing = new Map();
 let asked = false;
 let ended = false;
 
@@ -23,25 +24,30 @@ pose.on("state", (state) => {
   notice.textContent = state === "open" ? "" : "no connection: is `steadypose run web` running, and is this the address that it printed?";
 });
 pose.on("world", (message) => {
-  ended = message.end;
+  message.at = performance.now();
+  if (!message.end) worlds.set(message.source, (world = message));
+  const gone = (of) => (of === message.source ? message.end : worlds.get(of).at < message.at - 1000 * STALE_S);
+  for (const source of worlds.keys()) if (worlds.size > 1 && gone(source)) worlds.delete(source);
+  ended = message.end && [...worlds.keys()].every(gone);
   notice.textContent = ended ? "the stream has ended: these are its last poses" : "";
-  if (!ended) world = message;
   draw();
 });
-pose.on("events", ({ events }) => {
-  doing = new Map();
+pose.on("events", ({ source, events }) => {
+  const now = new Map();
+  doing.set(source, now);
   for (const event of events) {
-    if (event.phase !== "ENDS") doing.set(event.body, [...(doing.get(event.body) ?? []), label(event)]);
+    if (event.phase !== "ENDS") now.set(event.body, [...(now.get(event.body) ?? []), label(event)]);
+    if (event.phase !== "HOLDS") entry(source, event);
   }
 });
-pose.on("event", (event) => {
+function entry(source, event) {
   const list = document.getElementById("events");
   const item = document.createElement("li");
   item.className = event.phase;
-  item.textContent = `${event.body}: ${label(event)}${event.phase === "ENDS" ? ", no longer" : ""}`;
+  item.textContent = `${named(source, event.body)}: ${label(event)}${event.phase === "ENDS" ? ", no longer" : ""}`;
   list.prepend(item);
   while (list.children.length > KEPT) list.lastChild.remove();
-});
+}
 
 const rows = new Map();
 pose.on("health", ({ node, level, message, values }) => {
@@ -55,6 +61,11 @@ pose.on("health", ({ node, level, message, values }) => {
   const cells = [node, rate ? `${Number(rate).toFixed(0)} Hz` : values.state ?? "", late ? `${Number(late).toFixed(0)} ms` : ""];
   for (const text of cells) row.insertCell().textContent = text;
 });
+
+// A body's id, with its source if there are several.
+function named(source, id) {
+  return worlds.size > 1 ? `${source} ${id}` : `${id}`;
+}
 
 function label({ kind, hand }) {
   const words = kind === "LEFT" ? "is gone" : kind.toLowerCase().replaceAll("_", " ");  // left is also a side
@@ -80,11 +91,10 @@ function paint() {
   }
   pen.setTransform(scale, 0, 0, scale, 0, 0);
   pen.clearRect(0, 0, width, height);
-  const bodies = world?.bodies ?? [];
-  follow(bodies);
+  follow([...worlds.values()].flatMap(({ bodies }) => bodies));
   const project = camera(width, height);
   floor(project);
-  for (const body of bodies) person(body, project);
+  for (const [source, { bodies }] of worlds) for (const body of bodies) person(source, body, project);
 }
 
 // The viewpoint follows the middle of the bodies, at a distance at which all are in view.
@@ -130,7 +140,7 @@ function floor(project) {
   }
 }
 
-function person(body, project) {
+function person(source, body, project) {
   const points = body.positions.map((p, joint) => (body.state[joint] && !p.includes(null) ? project(p) : null));
   pen.lineCap = "round";
   pose.names.parents.forEach((parent, joint) => {
@@ -153,7 +163,7 @@ function person(body, project) {
   pen.fillStyle = "#dde3ee";
   pen.font = "13px system-ui, sans-serif";
   pen.textAlign = "center";
-  pen.fillText([body.id, ...(doing.get(body.id) ?? [])].join(" · "), head[0], head[1] - 26);
+  pen.fillText([named(source, body.id), ...(doing.get(source)?.get(body.id) ?? [])].join(" · "), head[0], head[1] - 26);
 }
 
 canvas.addEventListener("pointermove", (event) => {
