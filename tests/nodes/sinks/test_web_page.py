@@ -13,7 +13,7 @@ from tests.helpers.msg_strategies import diagnostics
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
-from steadypose.msgs.types import Event, EventKind, Hand, Message, Phase, PoseEvents
+from steadypose.msgs.types import Event, EventKind, Hand, Message, Phase, PoseEvents, PoseWorld
 from steadypose.nodes.sinks.web.node import hello, to_json
 from steadypose.nodes.sinks.web.server import WebServer
 
@@ -65,8 +65,8 @@ def told(kind: EventKind, phase: Phase, hand: Hand = Hand.NONE, body: int = 7) -
     return PoseEvents(10**9, "world", "test", [Event(body, kind, phase, hand, 0.9, np.zeros(3), 10**9)])
 
 
-def worlds() -> list[Message]:
-    return [message for topic, message in messages(1.0) if topic == POSE_WORLD]
+def worlds() -> list[PoseWorld]:
+    return [message for _, message in messages(1.0) if isinstance(message, PoseWorld)]
 
 
 def pixels(page: Any, colour: tuple[int, int, int]) -> int:
