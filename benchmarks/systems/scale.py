@@ -177,7 +177,7 @@ def _live_table(lived: list[dict[str, Any]]) -> Table:
     ]
     return Table.of(
         "scale_live", "A server's clients, from capture to pose/world at 30 Hz, less the delay, ms", clients,
-        {"clients": "{clients}", **LATENCIES, "answered, %": "{share:.1f}", "in time": "{timely}"},
+        {"clients": "{clients}", **LATENCIES, "answered, %": "{share:.0f}", "in time": "{timely}"},
         "One body a client. Answered: a client's messages that came back with its body. "
         f"In time: a p99 of {LATEST_MS:g} ms, for what is answered.",
     )  # fmt: skip
