@@ -26,8 +26,6 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
-from numba.core.extending import _Intrinsic
-
 from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
@@ -236,8 +234,9 @@ def _parts(function: FunctionType, loop: object) -> Iterator[str]:
         named = [function.__globals__[name] for name in code.co_names if name in function.__globals__]
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
         for value in (*constants, *code.co_names, *named, *cells):
-            if isinstance(value, _Intrinsic):  # writes instructions itself
-                yield from _parts(value._defn, loop)
+            # numba's intrinsics write instructions; their class is not imported, because a camera's node needs no numba
+            if intrinsic := getattr(value, "_defn", None):
+                yield from _parts(intrinsic, loop)
             elif value is not loop:
                 yield digest(value) if hasattr(value, "py_func") else _text(value)
 

@@ -60,7 +60,8 @@ def test_every_topic_has_publishers() -> None:
 
 def test_reading_a_launch_file_takes_none_of_the_nodes_libraries() -> None:
     code = (
-        "import sys; import steadypose.nodes.sources.pose_input; from steadypose.nodes.graph.launch import Launch; "
+        "import sys; import steadypose.nodes.sources.pose_input, steadypose.nodes.commands.node; "
+        "from steadypose.nodes.graph.launch import Launch; "
         "[Launch.read(name) for name in ('replay', 'oak', 'webcam', 'server', 'two_cameras', 'ros2')]; "
         "print(*({'torch', 'numba', 'cv2', 'depthai', 'rclpy', 'rerun', 'matplotlib'} & sys.modules.keys()))"
     )
