@@ -1,6 +1,6 @@
 """Results that are kept although what they measured has changed since, each with the reason."""
 
-_STEADY = "measured before the steady stage, which moves observed joints by a share of each revision"
+_STEADY = "measured before the steady stage and the fast matrix products, which its seconds and losses depend on little"
 
 STALE: dict[str, str] = dict.fromkeys(
     (
