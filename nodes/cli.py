@@ -95,7 +95,7 @@ def _main(arguments: list[str]) -> int:
     except Exception as error:
         if (told := told_of(error)) is None:
             raise
-        from steadypose.nodes.commands.output import printable  # imports numpy
+        from steadypose.nodes.settings import printable  # imports numpy
 
         print(f"steadypose {name}: {printable(told)}", file=sys.stderr)
         return USAGE_ERROR

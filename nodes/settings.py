@@ -111,3 +111,8 @@ def load_plugin(setting: str, reference: Any) -> Any:
         raise LaunchError(
             f"{setting}: {reference} cannot be imported: {error}; install its package beside steadypose"
         ) from error
+
+
+def printable(text: str) -> str:
+    """The text, with what a terminal would obey instead of showing it made visible."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)

@@ -21,11 +21,10 @@ from steadypose.nodes.commands.output import (
     console,
     plural,
     print_refused,
-    printable,
 )
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import LaunchError, printable
 from steadypose.prior.body.layouts import add_layouts
 
 

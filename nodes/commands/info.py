@@ -24,9 +24,10 @@ from steadypose.nodes.commands.inspect import (
     recording_at,
     subscribe,
 )
-from steadypose.nodes.commands.output import plural, printable
+from steadypose.nodes.commands.output import plural
 from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
+from steadypose.nodes.settings import printable
 from steadypose.nodes.sources.npz import is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.settings import PriorSettings

@@ -24,11 +24,11 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw, WorldBody
-from steadypose.nodes.commands.output import plural, printable
+from steadypose.nodes.commands.output import plural
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings, publishers
-from steadypose.nodes.settings import STREAMS, located
+from steadypose.nodes.settings import STREAMS, located, printable
 from steadypose.prior.settings import nearest
 
 PATIENCE_S = 3.0

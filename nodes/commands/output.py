@@ -157,11 +157,6 @@ def console() -> Console:
     return Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
 
-def printable(text: str) -> str:
-    """The text, with what a terminal would obey instead of showing it made visible."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-
-
 def plural(count: int, one: str, more: str) -> str:
     return f"{count} {one if count == 1 else more}"
 

@@ -19,7 +19,6 @@ from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.checks.problem import from_values
-from steadypose.nodes.commands.output import printable
 from steadypose.nodes.commands.run_table import lines, table
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
@@ -30,7 +29,7 @@ from steadypose.nodes.graph.process import ALIVE, READY, STOPPING, notify, stop_
 from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, RunLock, losses, write_health
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
-from steadypose.nodes.settings import STREAMS, located
+from steadypose.nodes.settings import STREAMS, located, printable
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 

@@ -8,10 +8,10 @@ from rich.text import Text
 
 from steadypose.msgs.types import Diagnostics, Level
 from steadypose.nodes.checks.problem import from_values
-from steadypose.nodes.commands.output import printable
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import NODES
+from steadypose.nodes.settings import printable
 
 LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
 """of the table's columns: the first to go where they do not fit"""
