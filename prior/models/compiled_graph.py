@@ -197,10 +197,8 @@ def _do(step, shapes, starts, weights, values, scratch, nothing):
             _gelu(a.ravel(), activated.ravel())
             a = activated
         weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
-        shift, product = (
-            weights[of_bias : of_bias + out.size].reshape(out.shape),
-            scratch[2, : out.size].reshape(out.shape),
-        )
+        shift = weights[of_bias : of_bias + out.size].reshape(out.shape)
+        product = scratch[2, : out.size].reshape(out.shape)
         if of_adjacency == _NONE:
             multiply(a, weight, shift, product)
         else:

@@ -182,11 +182,8 @@ class _TemporalLinear:
         for k, tap in enumerate(tap_of.ravel()):
             merged[:, tap] += weight[..., k]
         self._over_time = np.ascontiguousarray(taps.reshape(-1, taps.shape[-1]))
-        self._dense, self._inputs, self._outputs = (
-            Dense(merged.reshape(len(merged), -1), bias),
-            merged[0].size,
-            len(merged),
-        )
+        self._dense = Dense(merged.reshape(len(merged), -1), bias)
+        self._inputs, self._outputs = merged[0].size, len(merged)
 
     def __call__(self, x: Floats32) -> Floats32:
         """Map (B, T, in) to (B, T', out)."""
