@@ -192,9 +192,24 @@ def test_a_kiosk_starts_when_a_hand_is_raised_and_is_over_when_they_have_left(se
     send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.RIGHT))
     says("Here we go!")
     assert page.inner_text("#who") == "started by visitor 7, with the right hand"
-    send(server, POSE_EVENTS, told(EventKind.LEFT, Phase.BEGINS, body=8))
-    send(server, POSE_EVENTS, told(EventKind.LEFT, Phase.BEGINS))
+    for another in (told(EventKind.LEFT, Phase.BEGINS, body=8), at_the_door(told(EventKind.LEFT, Phase.BEGINS))):
+        send(server, POSE_EVENTS, another)
+    send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT, body=9))
+    send(server, POSE_EVENTS, told(EventKind.LEFT, Phase.BEGINS))  # ends it unless the visitor has become number 9
     says("Welcome")
+
+
+def at_the_door(message: PoseEvents) -> PoseEvents:
+    return dataclasses.replace(message, source="door")
+
+
+def test_a_kiosk_does_not_forget_who_faces_one_camera_when_nobody_faces_another(server: WebServer, opened: Any) -> None:
+    page = opened("/kiosk")
+    until(lambda: server.clients == 1)
+    send(server, POSE_EVENTS, told(EventKind.FACES_SENSOR, Phase.BEGINS))
+    send(server, POSE_EVENTS, at_the_door(told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT)))
+    send(server, POSE_EVENTS, at_the_door(told(EventKind.LEFT, Phase.BEGINS)))
+    until(lambda: page.text_content("#text") == "Raise a hand to start", timeout_s=SOON_S)
 
 
 def test_the_script_names_a_joint_that_there_is_not(server: WebServer, opened: Any) -> None:

@@ -81,8 +81,8 @@ export interface Connection {
   readonly state: "connecting" | "open" | "closed";
   on(kind: "world", handler: (world: World) => void): () => void;
   on(kind: "events", handler: (events: PoseEvents) => void): () => void;
-  /** each event that begins or ends */
-  on(kind: "event", handler: (event: PoseEvent) => void): () => void;
+  /** each event that begins or ends, with the source in which `body` is the person's id */
+  on(kind: "event", handler: (event: PoseEvent & { source: string }) => void): () => void;
   on(kind: "health", handler: (health: Health) => void): () => void;
   on(kind: "state", handler: (state: "open" | "closed") => void): () => void;
   close(): void;

@@ -3,7 +3,7 @@
 //   import { connect } from "http://127.0.0.1:8766/steadypose.js";
 //   const pose = connect({ token: "..." });
 //   pose.on("world", ({ bodies }) => bodies.forEach((body) => console.log(body.joint("left_wrist"))));
-//   pose.on("event", (event) => console.log(event.phase, event.kind, event.hand));
+//   pose.on("event", ({ source, body, kind, phase }) => console.log(source, body, kind, phase));
 //
 // Lengths are in metres, in a right-handed world with z up; stamps are capture times in seconds.
 
@@ -86,7 +86,8 @@ class Connection {
       message.bodies = message.bodies.map((body) => new Body(body, this.names));
       this.#tell("world", message);
     } else if (message.topic === "pose/events") {
-      for (const event of message.events) if (event.phase !== "HOLDS") this.#tell("event", event);
+      const { source } = message; // ids of bodies are its own
+      for (const event of message.events) if (event.phase !== "HOLDS") this.#tell("event", { source, ...event });
       this.#tell("events", message);
     } else if (message.topic === "diagnostics") {
       this.#tell("health", message);
