@@ -21,8 +21,9 @@ from steadypose.msgs.types import (
     Tracking,
     WorldBody,
 )
+from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 FPS = 30.0
 START_NS = 1_000_000_000
@@ -49,13 +50,8 @@ def walker(time: float, phase: float = 0.0) -> tuple[NDArray[np.float64], NDArra
         turn[J[f"{side}_shoulder"], 1] = 0.4 * swing
         turn[J[f"{side}_elbow"], 2] = -0.4 * sign
     local = Rotation.from_rotvec(turn) * Rotation.from_rotvec(lower)
-    positions = np.zeros((22, 3))
-    positions[0] = [1.1 * np.cos(circle), 1.1 * np.sin(circle), 0.90 + 0.02 * np.cos(2 * stride)]
-    turned = local.as_matrix()
-    for child in range(1, 22):
-        parent = PARENTS[child]
-        positions[child] = positions[parent] + turned[parent] @ REST_OFFSETS[child]
-        turned[child] = turned[parent] @ turned[child]
+    root = np.array([1.1 * np.cos(circle), 1.1 * np.sin(circle), 0.90 + 0.02 * np.cos(2 * stride)])
+    positions, _ = forward_kinematics(local.as_matrix(), REST_OFFSETS, root)
     velocity = 1.1 * 0.45 * np.array([-np.sin(circle), np.cos(circle), 0.0])
     return positions, local.as_quat(), velocity
 

@@ -5,23 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.helpers.bodies import world_body
+from tests.helpers.bodies import fk, world_body
 
 from steadypose.msgs.types import WorldBody
 from steadypose.nodes.sinks.ros2.rep155 import JOINTS, body_name, frames, joint_angles, measures, urdf
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 
 def body(turns: dict[str, Rotation], root: Rotation | None = None) -> WorldBody:
     """A body on the generic bones, with these local rotations."""
     local = Rotation.concatenate([turns.get(name, Rotation.identity()) for name in J])
     local = Rotation.concatenate([(root or Rotation.identity()) * local[0], local[1:]])
-    turned, positions = local.as_matrix(), np.zeros((22, 3))
-    for child, parent in enumerate(PARENTS):
-        if parent >= 0:
-            positions[child] = positions[parent] + turned[parent] @ REST_OFFSETS[child]
-            turned[child] = turned[parent] @ turned[child]
-    return world_body(positions, local.as_quat(), id=3)
+    return world_body(fk(local.as_matrix()), local.as_quat(), id=3)
 
 
 def forward(description: str, angles: dict[str, float], suffix: str) -> dict[str, np.ndarray]:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS, add_layouts, get_skeleton, to_canonical
+from steadypose.prior.body.layouts import COCO17, SKELETONS, add_layouts, get_skeleton, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, REST_POSITIONS, J
 
 EXPECTED_COUNTS = {
@@ -81,11 +81,6 @@ def test_only_a_pelvis_and_a_neck_that_are_interpolated_have_an_error_of_their_o
     assert errs["coco17"] == errs["blazepose33"] == {"pelvis", "neck"}
     assert errs["h36m17"] == errs["halpe26"] == {"pelvis"}, "their necks are measured"
     assert errs["smpl22"] == errs["kinect22"] == set()
-
-
-def test_canonical_maps_to_itself() -> None:
-    positions = np.random.default_rng(1).normal(size=(22, 3))
-    assert np.allclose(to_canonical(CANONICAL, positions)[0], positions)
 
 
 def test_unknown_names_say_what_is_known() -> None:

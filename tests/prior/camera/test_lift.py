@@ -3,10 +3,11 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from tests.helpers.bodies import fk
 
 from steadypose.benchmarks.depth_camera import Stereo, corrupt, render, room
 from steadypose.prior.body.layouts import COCO17
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.body.skeleton import REST_OFFSETS
 from steadypose.prior.camera.depth_lifting import MIN_CONFIDENCE, lift
 
 CAMERA = Stereo()
@@ -142,11 +143,7 @@ def standing(yaw: float) -> np.ndarray:
     for left, right in ((18, 19), (20, 21)):
         offsets[left] = 0.03, 0.01, -0.26
         offsets[right] = 0.03, -0.01, -0.26
-    joints = np.zeros((22, 3))
-    for child, parent in enumerate(PARENTS):
-        if parent >= 0:
-            joints[child] = joints[parent] + offsets[child]
-    forward, left, up = joints.T
+    forward, left, up = fk(np.tile(np.eye(3), (22, 1, 1)), offsets).T
     c, s = np.cos(yaw), np.sin(yaw)
     # facing the camera, forward is -z and the left side is on the right of the image
     return np.stack([c * left - s * forward, -up, 3.0 - (c * forward + s * left)], axis=-1)
