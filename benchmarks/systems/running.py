@@ -14,7 +14,7 @@ from rich.console import Console
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph.clock import POLL_S, SystemClock
+from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import WATCHER
 from steadypose.nodes.graph.supervisor import Supervisor
@@ -36,7 +36,7 @@ class Running(NamedTuple):
     """source of ``messages``, for callers who do not want to wait for them"""
     supervisor: Supervisor
     """the supervisor of their processes"""
-    clock: SystemClock
+    clock: Clock
     """their clock"""
     endpoints: list[str]
     """where they publish"""
@@ -54,7 +54,7 @@ def running(recording: Path, *settings: str) -> Iterator[Running]:
 def running_nodes(nodes: Sequence[str], settings: Sequence[str]) -> Iterator[Running]:
     """Run the processes of these nodes, with these settings over those of ``launch/replay.toml``."""
     console = Console(stderr=True)
-    clock = SystemClock()
+    clock = Clock()
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
         settings = [*settings, f"nodes={json.dumps(list(nodes))}", f"transport.directory={json.dumps(folder)}"]
         arguments = ["--launch", "replay", *(word for setting in settings for word in ("--set", setting))]

@@ -85,12 +85,12 @@ def listen(launch_file: str, console: Console) -> int:
     from steadypose.msgs.types import Diagnostics, PoseRaw
     from steadypose.nodes.checks.problem import error, from_values
     from steadypose.nodes.checks.stream import StreamCheck
-    from steadypose.nodes.graph.clock import POLL_S, SystemClock
+    from steadypose.nodes.graph.clock import POLL_S, Clock
     from steadypose.nodes.graph.launch import Launch
     from steadypose.nodes.graph.topology import POSE_NODES
     from steadypose.prior.clean.settings import PriorSettings
 
-    clock, launch = SystemClock(), Launch.read(launch_file)
+    clock, launch = Clock(), Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
     check = StreamCheck(launch.settings(PriorSettings))
     addresses, nodes_at = launch.addresses("pose_input"), [transport.endpoint(name) for name in POSE_NODES]

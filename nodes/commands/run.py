@@ -21,7 +21,7 @@ from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.commands.run_table import lines, table
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock
+from steadypose.nodes.graph.clock import POLL_S, Clock
 from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER
@@ -108,7 +108,7 @@ def run(
         if COMPILED & {*nodes}:
             compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
         identity = secrets.token_hex(8)
-        watched = _Run(settled, arguments, console, SystemClock(), identity=identity, writes_health=lock.has_health)
+        watched = _Run(settled, arguments, console, Clock(), identity=identity, writes_health=lock.has_health)
         return watched.watch()
 
 

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from steadypose.prior.timing.rate import FPS
 
@@ -19,30 +19,18 @@ POLL_S = 0.1
 """Longest time a node waits for anything before it checks whether to stop, seconds."""
 
 
-class Clock(Protocol):
-    """Time for nodes. Tests pass a virtual clock that does not wait."""
-
-    def now_ns(self) -> int:
-        """Wall time for stamps, nanoseconds since 1970. It steps when the system clock is set."""
-        ...
-
-    def monotonic_ns(self) -> int:
-        """Monotonic time for durations, nanoseconds since an arbitrary start. It never steps."""
-        ...
-
-    def sleep(self, duration_ns: int) -> None: ...
-
-
-class SystemClock:
-    """The system's clocks.
+class Clock:
+    """The system's clocks. Tests pass one that does not wait.
 
     The wall clock can step: a machine without a battery-backed clock boots with a wrong time and sets it later.
     """
 
     def now_ns(self) -> int:
+        """Wall time for stamps, nanoseconds since 1970."""
         return time.time_ns()
 
     def monotonic_ns(self) -> int:
+        """Monotonic time for durations, nanoseconds since an arbitrary start. It never steps."""
         return time.monotonic_ns()
 
     def sleep(self, duration_ns: int) -> None:

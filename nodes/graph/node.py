@@ -33,7 +33,7 @@ from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.checks.problem import Problem, check_wire, error
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.graph.clock import POLL_S, Clock, SystemClock, Timeline
+from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.health import STALL_NS, Health
 from steadypose.nodes.graph.inbox import Inbox
 from steadypose.nodes.graph.launch import Launch
@@ -75,7 +75,7 @@ class Node(ABC):
         if extra := NODES[self.name].extra:
             require_extra(extra)
         self.launch = launch
-        self.clock: Clock = clock or SystemClock()
+        self.clock = clock or Clock()
         self._timeline: Timeline | None = None
         self._set_ns = 0
         self.health = Health(self.clock)

@@ -18,7 +18,7 @@ from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
 from steadypose.msgs.topics import DIAGNOSTICS, TOPICS
 from steadypose.msgs.types import Diagnostics, Message
-from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError, path_setting
@@ -111,7 +111,7 @@ def free_directory(launch: Launch) -> Path | None:
 
 def _replays(launch: Launch) -> bool:
     own = "pose_input" in launch.nodes
-    return own and not isinstance(open_input(launch.settings(InputSettings), SystemClock()), LiveSource)
+    return own and not isinstance(open_input(launch.settings(InputSettings), Clock()), LiveSource)
 
 
 def _is_recording(directory: Path) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 from steadypose.msgs.security import Keys
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import STREAMS, LaunchError, load_plugin, path_setting
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource, open_oak, open_webcam
@@ -114,4 +114,4 @@ def check_input(launch: Launch) -> None:
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
     """
-    open_input(launch.settings(InputSettings), SystemClock())
+    open_input(launch.settings(InputSettings), Clock())

@@ -18,13 +18,14 @@ from tests.helpers.synthetic_poses import walker
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 
 START_NS = 1_700_000_000_000_000_000
 
 
-class VirtualClock:
+class VirtualClock(Clock):
     """Time that passes only when somebody sleeps."""
 
     def __init__(self) -> None:

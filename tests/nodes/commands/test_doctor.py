@@ -20,7 +20,7 @@ from steadypose.nodes.commands import doctor_checks as checks
 from steadypose.nodes.commands.doctor import doctor
 from steadypose.nodes.commands.doctor_checks import INSTALL, Finding, Verdict
 from steadypose.nodes.extras import install_command
-from steadypose.nodes.graph.clock import SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError
@@ -235,7 +235,7 @@ def file(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
     """Status and text of a doctor who listens to a tracker with these frames; to nobody without."""
     console = Console(record=True, width=200)
-    node = Tracker(Launch.read(file), SystemClock())
+    node = Tracker(Launch.read(file), Clock())
     node.frames = tuple(frames)
     with running(*[node] if frames else []):
         return live.listen(file, console), console.export_text()

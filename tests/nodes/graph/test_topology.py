@@ -11,7 +11,7 @@ import pytest
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD, TOPICS
 from steadypose.nodes.extras import EXTRAS
 from steadypose.nodes.graph import topology
-from steadypose.nodes.graph.clock import SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, NodeDeclaration, load, publishers
@@ -109,7 +109,7 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
     package.opens = opens
     launch = read(tmp_path / "a.toml", '[input]\nsource = "acme:opens"\noptions = {port = 7}')
     settings = launch.settings(InputSettings)
-    assert open_input(settings, SystemClock()) is source
+    assert open_input(settings, Clock()) is source
     assert given == [({"port": 7}, settings.calibration)]
 
 

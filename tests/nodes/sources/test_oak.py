@@ -34,7 +34,7 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld
 from steadypose.nodes.commands.calibrate import CalibrateOak, calibrate
 from steadypose.nodes.commands.run import _check
-from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
@@ -49,7 +49,7 @@ from steadypose.nodes.sources.source import CalibrationSettings, CameraError, Oa
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.camera.calibration import CalibrationError
 
-CONTEXT = SourceContext(SystemClock(), CalibrationSettings())
+CONTEXT = SourceContext(Clock(), CalibrationSettings())
 MakeLaunch = Callable[..., Launch]
 BODY = [i for i, name in enumerate(COCO17.joints) if name.split("_")[-1] not in ("nose", "eye", "ear")]
 
@@ -64,7 +64,7 @@ def take(host: Host, frames: int) -> list[PoseRaw]:
 
 
 def test_people_are_lifted_where_they_stand(walk: list[Moment]) -> None:
-    with plugged(script(walk), SystemClock()) as host:
+    with plugged(script(walk), Clock()) as host:
         frames = take(host, len(walk))
     assert [frame.frame_id for frame in frames] == [FRAME_ID] * len(walk)
     assert {frame.skeleton for frame in frames} == {"coco17"}
@@ -86,7 +86,7 @@ def test_the_newest_image_is_there_for_the_viewer(walk: list[Moment], tmp_path: 
     colour.setTimestamp(messages[0][1].getTimestamp())
     with (
         closing(ImageWriter(tmp_path / "image")) as writer,
-        plugged([("colour", colour), *messages], SystemClock(), writer=writer) as host,
+        plugged([("colour", colour), *messages], Clock(), writer=writer) as host,
     ):
         (frame,) = take(host, 1)
         reader = ImageReader(tmp_path / "image")
@@ -105,7 +105,7 @@ def test_stamps_are_of_capture(walk: list[Moment]) -> None:
     before = time.time_ns()
     messages = script(walk)
     after = time.time_ns()
-    with plugged(messages, SystemClock()) as host:
+    with plugged(messages, Clock()) as host:
         stamps = [frame.stamp_ns for frame in take(host, len(walk))]
     assert before - 5_000_000 < stamps[0] < after + 5_000_000, "wall time at which the first frame was made"
     np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
@@ -113,7 +113,7 @@ def test_stamps_are_of_capture(walk: list[Moment]) -> None:
 
 @pytest.mark.parametrize("milliseconds", [-15, 12, 16])
 def test_colour_and_depth_need_not_be_captured_together(walk: list[Moment], milliseconds: int) -> None:
-    with plugged(script(walk, depth_late=timedelta(milliseconds=milliseconds)), SystemClock()) as host:
+    with plugged(script(walk, depth_late=timedelta(milliseconds=milliseconds)), Clock()) as host:
         stamps = [frame.stamp_ns for frame in take(host, len(walk) - 1)]
     np.testing.assert_allclose(np.diff(stamps) / 1e9, 1 / 30, atol=1e-5)
 
@@ -122,7 +122,7 @@ def test_the_imu_levels_the_camera(walk: list[Moment]) -> None:
     tilt = Rotation.from_euler("xz", [20, -5], degrees=True)
     up = tilt.apply([0.0, -1.0, 0.0])
     mounted = Rotation.from_euler("y", 90, degrees=True)
-    with plugged(script(walk, up=mounted.inv().apply(up).tolist()), SystemClock(), mounted.as_matrix()) as host:
+    with plugged(script(walk, up=mounted.inv().apply(up).tolist()), Clock(), mounted.as_matrix()) as host:
         frame = take(host, len(walk))[-1]
         measured = host.level.measured
     assert measured
@@ -149,7 +149,7 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     source = CameraSource(
         CONTEXT.clock, lambda: opener(lambda _: script(scene))(launch.settings(InputSettings).oak, CONTEXT.clock)
     )
-    nodes = [PoseInputNode(launch, SystemClock(), source), PriorNode(launch), TrajectoryNode(launch)]
+    nodes = [PoseInputNode(launch, Clock(), source), PriorNode(launch), TrajectoryNode(launch)]
     worlds: list[PoseWorld] = []
     with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
         end = time.monotonic() + 120
@@ -179,7 +179,7 @@ def test_frames_end_when_the_camera_is_unplugged(walk: list[Moment]) -> None:
         pipeline.stop()
 
     taken = threading.Event()
-    with plugged(script(walk[:2]), SystemClock(), unplug=pull) as host:
+    with plugged(script(walk[:2]), Clock(), unplug=pull) as host:
         frames = host.frames()
         for _ in range(2):
             assert next(frame for frame in frames if frame)
@@ -217,7 +217,7 @@ def test_a_camera_that_falls_silent_is_given_up(clock: VirtualClock, walk: list[
 def test_a_program_that_is_late_gets_the_newest_frames(walk: list[Moment]) -> None:
     moments = [walk[index % len(walk)] for index in range(QUEUE + 3)]
     messages = script(moments)
-    with plugged(messages, SystemClock()) as host:
+    with plugged(messages, Clock()) as host:
         end = time.monotonic() + 20
         while host.counts["late"] < 3 and time.monotonic() < end:
             time.sleep(0)  # the pipeline's threads run
@@ -247,7 +247,7 @@ def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Mome
         message.setTimestamp(whole.getTimestamp())
         message.setSequenceNum(place // 2)
         messages[place] = (name, message)
-    with plugged(messages, SystemClock()) as host:
+    with plugged(messages, Clock()) as host:
         frames = take(host, 3)
     counts = host.counts
     assert sum(n for cause, n in counts.items() if cause.startswith("frame: ")) == 1, counts
@@ -267,13 +267,13 @@ def test_an_archive_that_is_not_there_says_so(tmp_path: Path) -> None:
 def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
     launch = Launch.read("oak")
     assert not launch.transport.lossless
-    assert isinstance(open_input(launch.settings(InputSettings), SystemClock()), CameraSource)
+    assert isinstance(open_input(launch.settings(InputSettings), Clock()), CameraSource)
     _check(launch)
 
 
 def test_without_a_camera_it_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(oak_device.dai.Device, "getAllAvailableDevices", staticmethod(list))
-    with pytest.raises(RuntimeError, match="no camera found"), oak_device.connect(OakSettings(), SystemClock()):
+    with pytest.raises(RuntimeError, match="no camera found"), oak_device.connect(OakSettings(), Clock()):
         pass
     (tmp_path / "kitchen.toml").write_text("")
     with pytest.raises(CalibrationError, match="no camera found"):

@@ -20,7 +20,7 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.nodes import extras
-from steadypose.nodes.graph.clock import Clock, SystemClock
+from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources import camera, webcam_device
@@ -89,7 +89,7 @@ def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> CameraSou
 
 def test_each_image_gives_the_bodies_in_it(video: Path, model: str) -> None:
     seen = Seen()
-    source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), seen)
+    source = open_webcam(WebcamSettings(camera=3, model=model), Clock(), seen)
     frames: list[PoseRaw] = []
     for frame in source.frames():
         if frame is None:
@@ -144,7 +144,7 @@ def test_an_image_that_fails_is_counted_and_the_next_one_comes(video: Path, mode
                 cv2.cvtColor(image[:0], cv2.COLOR_BGR2RGB)  # nothing, where an image is expected
             return found
 
-    source = open_webcam(WebcamSettings(camera=3, model=model), SystemClock(), Stumbles())
+    source = open_webcam(WebcamSettings(camera=3, model=model), Clock(), Stumbles())
     frames = source.frames()
     assert [next(frames) is not None for _ in range(FRAMES)] == [True, False, True, False, True]
     status = source.status()
@@ -179,7 +179,7 @@ def test_a_video_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None
     (tmp_path / "x.mp4").write_bytes(b"no video")
     settings = InputSettings(source="webcam", webcam=WebcamSettings(video=str(tmp_path / "x.mp4"), model=model))
     with pytest.raises(LaunchError, match="expected a video that OpenCV can read"):
-        camera.open_webcam(settings.webcam, SourceContext(SystemClock(), NOT_CALIBRATED))
+        camera.open_webcam(settings.webcam, SourceContext(Clock(), NOT_CALIBRATED))
 
 
 def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
@@ -225,13 +225,13 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
-        camera.open_webcam(settings, SourceContext(SystemClock(), NOT_CALIBRATED))
+        camera.open_webcam(settings, SourceContext(Clock(), NOT_CALIBRATED))
 
 
 def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(LaunchError, match="add webcam"):
-        open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), SystemClock())
+        open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), Clock())
 
 
 def test_the_launch_file_needs_no_download() -> None:
