@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from tests.helpers.bodies import stream
 
-from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw
-from steadypose.prior.clean.frame import Gated, Observation
+from steadypose.msgs.types import CleanBody, JointState, PoseClean, PoseRaw
+from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.clean.frame import Estimate, Gated, Observation
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -40,3 +41,11 @@ def gated(positions: np.ndarray, stamp_s: float = 0.0) -> Gated:
     """Bodies (S, 22, 3) that are all there, as they came."""
     faulty = np.zeros(positions.shape[:2], dtype=bool)
     return Gated(observation(positions, stamp_s), positions, np.zeros(len(positions)), faulty)
+
+
+def estimate(positions: np.ndarray, sigma: float = 0.01) -> Estimate:
+    """Of bodies (S, 22, 3) that are observed, each joint to ``sigma`` metres."""
+    count = len(positions)
+    turns, bones = np.tile(np.eye(3), (count, 22, 1, 1)), np.tile(REST_OFFSETS, (count, 1, 1))
+    state = np.full((count, 22), JointState.REFINED, dtype=np.uint8)
+    return Estimate(0.0, positions, turns, bones, np.full((count, 22), sigma), state)

@@ -9,13 +9,12 @@ from tests.helpers.bodies import waving
 from tests.helpers.values import gated
 
 from steadypose.prior.arrays import medians
-from steadypose.prior.body.skeleton import PARENTS, REST_POSITIONS
+from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.clean import reconstruct, sensor_error
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.reconstruct import Denoise
 from steadypose.prior.clean.sensor_error import DepthError
 from steadypose.prior.compiled import median
-from steadypose.prior.models import posture
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
@@ -72,41 +71,6 @@ def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, mi
         a, b, c, d, e, f = form
         values = np.linalg.eigvalsh([[a, d, e], [d, b, f], [e, f, c]])
         np.testing.assert_allclose(left_out[slot] ** 2, sensor_error.LEFT_OUT * (values[2] - values[1]), atol=1e-12)
-
-
-@settings(deadline=None, max_examples=20)
-@given(SEEDS)
-def test_one_observation_after_the_other_tells_what_all_of_them_tell(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    factor, noise = 0.1 * rng.normal(size=(66, 66)), 10.0 ** rng.uniform(-10.0, -1.0, 66)
-    covariance, off = factor @ factor.T, rng.normal(0.0, 0.1, 66)
-    gain = covariance @ np.linalg.inv(covariance + np.diag(noise))
-    expected, left = off[None].copy(), np.empty((1, 66, 66))
-    posture._condition(covariance, noise[None], expected, left)
-    np.testing.assert_allclose(expected[0], gain @ off, atol=1e-8)
-    np.testing.assert_allclose(left[0], covariance - gain @ covariance, atol=1e-8)
-
-
-@settings(deadline=None, max_examples=20)
-@given(SEEDS)
-def test_joints_on_bones_are_those_of_an_iterated_extended_kalman_filter(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    prior = (REST_POSITIONS + rng.normal(0.0, 0.03, REST_POSITIONS.shape)).ravel()
-    factor = 0.02 * rng.normal(size=(66, 66))
-    covariance, lengths = factor @ factor.T, rng.uniform(0.05, 0.5, 21)
-    mean, left = prior.copy(), covariance
-    for _ in range(posture._ROUNDS):
-        slope, bones = np.zeros((21, 22, 3)), bones_of(mean.reshape(22, 3))
-        long = np.linalg.norm(bones, axis=-1)
-        for k, above in enumerate(PARENTS[1:]):
-            slope[k, k + 1], slope[k, above] = bones[k] / long[k], -bones[k] / long[k]
-        slope = slope.reshape(21, 66)
-        gain = covariance @ slope.T @ np.linalg.inv(slope @ covariance @ slope.T + posture.LENGTH_SIGMA**2 * np.eye(21))
-        mean = prior + gain @ (lengths - long + slope @ (mean - prior))
-        left = covariance - gain @ slope @ covariance
-    given_mean, given_left = posture.on_bones(prior.reshape(1, 22, 3), covariance[None], lengths[None])
-    np.testing.assert_allclose(given_mean.ravel(), mean, atol=1e-9)
-    np.testing.assert_allclose(given_left[0], left, atol=1e-9)
 
 
 @settings(deadline=None, max_examples=20)

@@ -8,9 +8,8 @@ from tests.helpers.bodies import waving
 from tests.helpers.values import clean_bodies
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.score import OwnScale, Scorer
-from steadypose.prior.clean.settings import PriorSettings, ScoreSettings
+from steadypose.prior.clean.settings import ScoreSettings
 from steadypose.prior.models.hgvae.config import FaultNetConfig
 from steadypose.prior.models.hgvae.faults import (
     FROZEN_ODDS,
@@ -114,13 +113,6 @@ def test_the_weights_that_ship_find_the_wrist_of_which_the_last_answer_is_repeat
     assert np.nanargmax(spoilt.joint_anomaly) == J["left_wrist"]
 
 
-def test_clean_motion_is_no_anomaly_and_frames_are_scored_alike_twice() -> None:
-    clean = waving(90)
-    bodies = clean_bodies(clean, delay=0)
-    assert not any(b.anomaly_flag for b in bodies)
-    assert [b.anomaly for b in bodies] == [b.anomaly for b in clean_bodies(clean, delay=0)]
-
-
 def test_exchanged_arms_raise_the_flag_which_goes_down_after_they_are_over() -> None:
     """The gate is off: it would put them back."""
     spoilt = waving(200)
@@ -171,8 +163,3 @@ def test_switched_off_nothing_is_scored() -> None:
     bodies = clean_bodies(waving(30), delay=0, score={"enabled": False})
     assert np.isnan([b.anomaly for b in bodies]).all()
     assert not any(b.anomaly_flag for b in bodies)
-
-
-def test_an_impossible_rate_is_refused() -> None:
-    with pytest.raises(ValueError, match="false_alarms"):
-        PriorPipeline(PriorSettings.from_dict({"score": {"false_alarms": 0.0}}))

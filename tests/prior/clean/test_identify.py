@@ -151,19 +151,6 @@ def test_longer_bones_are_somebody_elses_by_their_likelihood() -> None:
     assert found == pytest.approx(norm.logpdf(0.05, 0.0, same**0.5) - norm.logpdf(0.05, 0.0, other**0.5) - 3.0)
 
 
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        ({"birth": -1.0}, "birth: expected 0 to 60 seconds"),
-        ({"death": float("nan")}, "death: expected"),
-        ({"death": 0.0}, "death: expected"),  # with which nobody would ever get an id
-    ],
-)
-def test_settings_that_cannot_be_are_refused(setting: dict[str, float], expected: str) -> None:
-    with pytest.raises(ValueError, match=expected):
-        PriorSettings.from_dict({"identify": setting})
-
-
 def test_the_pipeline_gives_unnumbered_bodies_ids_and_passes_a_trackers_on() -> None:
     def run(**settings: object) -> list[set[int]]:
         pipeline = PriorPipeline(PriorSettings.from_dict(settings))

@@ -1,14 +1,12 @@
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from tests.helpers.bodies import noisy, waving
-from tests.helpers.values import clean_bodies
+from tests.helpers.values import clean_bodies, estimate
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
-from steadypose.prior.clean.frame import Estimate
 from steadypose.prior.clean.posture import AT_MOST, LITTLE, SHARE, SPREAD, Posture, mix
 from steadypose.prior.clean.settings import PostureSettings
 from steadypose.prior.models.posture import LivePosture
@@ -21,13 +19,6 @@ CERTAIN = np.ones(1)
 
 def _positions(seen: np.ndarray, enabled: bool = True) -> np.ndarray:
     return np.array([body.positions for body in clean_bodies(seen, posture={"enabled": enabled})])
-
-
-def _estimate(off: np.ndarray, sigma: float) -> Estimate:
-    """Of a body at rest, moved by ``off`` (22, 3)."""
-    positions, turns = (REST_POSITIONS + off)[None], np.broadcast_to(np.eye(3), (1, 22, 3, 3))
-    state = np.full((1, 22), JointState.REFINED, dtype=np.uint8)
-    return Estimate(0.0, positions, turns, REST_OFFSETS[None], np.full((1, 22), sigma), state)
 
 
 def test_an_error_that_lasts_gets_smaller() -> None:
@@ -43,7 +34,7 @@ def test_a_perfect_input_stays() -> None:
 
 
 def test_joints_move_a_share_of_the_way_and_in_white_noise_those_observed_are_then_surer() -> None:
-    before = _estimate(np.random.default_rng(1).normal(0.0, 0.02, (22, 3)), 0.02)
+    before = estimate(REST_POSITIONS + np.random.default_rng(1).normal(0.0, 0.02, (1, 22, 3)), 0.02)
     before.state[0, J["left_wrist"]] = JointState.IMPUTED
     after = Posture(PostureSettings()).update(before, LENGTHS, NOISE, CERTAIN)
     whole = LivePosture.load("default", SPREAD)(before.positions, before.sigma, LENGTHS).positions - before.positions
@@ -56,7 +47,7 @@ def test_joints_move_a_share_of_the_way_and_in_white_noise_those_observed_are_th
 
 
 def test_in_little_white_noise_joints_hardly_move_however_unsure_the_smoother_is() -> None:
-    before = _estimate(np.random.default_rng(2).normal(0.0, 0.02, (22, 3)), 0.03)
+    before = estimate(REST_POSITIONS + np.random.default_rng(2).normal(0.0, 0.02, (1, 22, 3)), 0.03)
     little = np.array([0.2 * LITTLE / AT_MOST])
     for lasting, low, high in ((0.0, 0.0, 0.001), (1.0, 0.005, 0.1)):
         after = Posture(PostureSettings()).update(before, LENGTHS, little, np.array([lasting]))
@@ -64,20 +55,13 @@ def test_in_little_white_noise_joints_hardly_move_however_unsure_the_smoother_is
 
 
 def test_a_slot_without_a_body_stays_empty() -> None:
-    body = _estimate(np.full((22, 3), 0.01), 0.02)
-    twice = {name: np.concatenate([getattr(body, name)] * 2) for name in vars(body) if name != "stamp_s"}
-    both = replace(body, **twice)
+    body, both = (estimate(np.tile(REST_POSITIONS + 0.01, (count, 1, 1)), 0.02) for count in (1, 2))
     both.positions[1], both.sigma[1] = np.nan, np.inf
     after = Posture(PostureSettings()).update(both, np.concatenate([LENGTHS, LENGTHS]), np.full(2, 0.02), np.ones(2))
     assert np.isnan(after.positions[1]).all()
     assert np.isinf(after.sigma[1]).all()
     alone = Posture(PostureSettings()).update(body, LENGTHS, NOISE, CERTAIN)
     np.testing.assert_array_equal(after.positions[0], alone.positions[0])
-
-
-def test_it_is_off_when_it_is_switched_off() -> None:
-    seen = noisy(FRAMES, 0.02)
-    assert np.abs(_positions(seen) - _positions(seen, enabled=False)).max() > 0.005
 
 
 def test_a_joint_between_two_observations_is_as_sure_as_its_own_filters() -> None:
@@ -113,20 +97,8 @@ RNG = np.random.default_rng(4)
 SPINES, COLLARS = [J["spine1"], J["spine2"]], [J["left_collar"], J["right_collar"]]
 
 
-def estimate(bodies: int = 2) -> Estimate:
-    """Joints anywhere, each known to a centimetre."""
-    return Estimate(
-        stamp_s=0.0,
-        positions=RNG.normal(size=(bodies, 22, 3)),
-        rotations=np.tile(np.eye(3), (bodies, 22, 1, 1)),
-        offsets=np.zeros((bodies, 22, 3)),
-        sigma=np.full((bodies, 22), 0.01),
-        state=np.full((bodies, 22), JointState.REFINED, dtype=np.uint8),
-    )
-
-
 def test_joints_that_a_kinect_lacks_are_means_of_its_own_in_the_body_that_lacks_them_alone() -> None:
-    given, unseen_s = estimate(), np.zeros((2, 22))
+    given, unseen_s = estimate(RNG.normal(size=(2, 22, 3))), np.zeros((2, 22))
     unseen_s[1, SPINES + COLLARS] = np.inf
     mixed = mix(given, unseen_s)
     p = given.positions[1]
@@ -142,7 +114,7 @@ def test_joints_that_a_kinect_lacks_are_means_of_its_own_in_the_body_that_lacks_
 
 
 def test_a_spine_between_joints_that_are_unknown_too_follows_from_rotations() -> None:
-    given, unseen_s = estimate(1), np.zeros((1, 22))
+    given, unseen_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
     unseen_s[0, [*SPINES, *COLLARS, J["spine3"]]] = np.inf
     mixed = mix(given, unseen_s)
     np.testing.assert_array_equal(mixed.positions[0, SPINES], given.positions[0, SPINES])
@@ -150,6 +122,6 @@ def test_a_spine_between_joints_that_are_unknown_too_follows_from_rotations() ->
 
 
 def test_a_joint_that_is_hidden_for_a_while_is_no_mixture() -> None:
-    given, unseen_s = estimate(1), np.zeros((1, 22))
+    given, unseen_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
     unseen_s[0, SPINES + COLLARS] = 3.0
     assert mix(given, unseen_s) is given
