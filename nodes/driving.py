@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,19 +62,18 @@ class Diagnosis:
     """Checks an offline stream, whose frames are assumed to arrive at 30 Hz.
 
     Attributes:
-        problems: texts by cause, as first detected.
+        problems: the problems by cause, as first detected.
         frames: number of frames so far.
     """
 
     def __init__(self, settings: PriorSettings) -> None:
-        self.problems: dict[str, str] = {}
+        self.problems: dict[str, Problem] = {}
         self._check = StreamCheck(settings)
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
         self._last_ns = self._span_ns = self._back_ns = 0
         self._useless = False
-        self._inhabited = self._anybody = False
-        self._looks = self._lying = 0
+        self._inhabited = self._looks = self._lying = 0
         self.frames = 0
 
     def see(self, raw: PoseRaw) -> None:
@@ -85,17 +84,14 @@ class Diagnosis:
         self._span_ns = max(self._span_ns, abs(raw.stamp_ns - self._first_ns))
         self._back_ns = max(self._back_ns, self._last_ns - raw.stamp_ns)
         self._last_ns = raw.stamp_ns
-        self._inhabited |= bool(raw.bodies)
-        self._anybody |= bool(raw.bodies)
         self.frames += 1
 
     def look(self) -> list[str]:
         """Examine the last frames. Returns the new problems, one line each."""
         found = self._check.problems((self.frames - 1) * CHECKED_NS // CHECKED, live=False)
-        self._useless |= any(problem.level == Level.ERROR for problem in found)
-        self._looks += self._inhabited
+        self._looks += self._check.inhabited > self._inhabited
+        self._inhabited = self._check.inhabited
         self._lying += any(problem.cause in LYING for problem in found)
-        self._inhabited = False
         return self._note(found)
 
     def end(self) -> list[str]:
@@ -114,7 +110,7 @@ class Diagnosis:
         """
         if not self.trusted or 0 < given >= asked / 2:
             return []
-        if not self._anybody:
+        if not self._check.inhabited:
             found = error("nobody", "no frame has a body: expected joints; does the tracker detect people?")
         elif not given:
             found = error(
@@ -126,13 +122,15 @@ class Diagnosis:
                 "few_poses",
                 f"{given} of {asked} frames with a body gave a pose: expected nearly all; what is not used is counted",
             )
-        self._useless = True
         return self._note([found])
 
     def _note(self, found: Iterable[Problem]) -> list[str]:
-        new = {problem.cause: problem.text for problem in found if problem.cause not in self.problems}
-        self.problems |= new
-        return [f"{cause}: {text}" for cause, text in new.items()]
+        new = []
+        for problem in found:
+            self._useless |= problem.level == Level.ERROR
+            if self.problems.setdefault(problem.cause, problem) is problem:
+                new.append(str(problem))
+        return new
 
     @property
     def trusted(self) -> bool:
@@ -142,27 +140,34 @@ class Diagnosis:
     @property
     def texts(self) -> list[str]:
         """All problems so far, one line each."""
-        return [f"{cause}: {text}" for cause, text in self.problems.items()]
+        return list(map(str, self.problems.values()))
 
 
 class OfflineRun:
     """Runs both pipelines on a recorded source, with ``[prior]`` and ``[trajectory]`` of a launch file. It can be
     iterated once, and yields the messages of `stream`.
 
-    ``timeline``, if given, collects the events; ``diagnosis`` has the problems of the input, ``poses`` counts the
-    bodies in the output so far. Raises LaunchError if a setting is unknown, or its value is invalid.
+    ``timeline``, if given, collects the events; ``advanced`` is called after each frame of the input. ``diagnosis`` has
+    the problems of the input, ``stamps_ns`` its stamps, ``poses`` counts the bodies in the output so far. Raises
+    LaunchError if a setting is unknown or its value invalid and, at the end, if no frame could be read.
     """
 
-    def __init__(self, source: RecordedSource, settings: Settings, timeline: EventTimeline | None = None) -> None:
+    def __init__(
+        self,
+        source: RecordedSource,
+        settings: Settings,
+        timeline: EventTimeline | None = None,
+        advanced: Callable[[], None] = lambda: None,
+    ) -> None:
         # imported late, because these imports compile loops
         from steadypose.nodes.graph.prior_node import make_prior
         from steadypose.nodes.graph.threads import one_thread
         from steadypose.nodes.graph.trajectory_node import make_trajectory
 
         one_thread()
-        self._source, self._timeline = source, timeline
+        self._source, self._timeline, self._advanced = source, timeline, advanced
         self._prior, self._trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
-        self._stamps_ns: list[int] = []
+        self.stamps_ns: list[int] = []
         prior = PriorSettings.from_dict(settings["prior"])
         self.diagnosis = Diagnosis(prior)
         self._identifies = prior.identify.enabled
@@ -174,7 +179,8 @@ class OfflineRun:
         sensor, calibrated = NOWHERE, False
         for topic, message in stream(self._source, self._prior, self._trajectory):
             if isinstance(message, PoseRaw) and not message.end_of_stream:
-                self._stamps_ns.append(message.stamp_ns)
+                self.stamps_ns.append(message.stamp_ns)
+                self._advanced()
                 self.diagnosis.see(message)
                 if any(np.isfinite(observed(body)[:, 0]).sum() >= ENOUGH for body in message.bodies):
                     self._asked.add(round(message.stamp_ns / FRAME_NS))
@@ -187,18 +193,10 @@ class OfflineRun:
             elif self._timeline and topic == POSE_WORLD and isinstance(message, PoseWorld):
                 self._timeline.add(message, sensor, calibrated=calibrated)
             yield topic, message
+        if not self.stamps_ns:
+            raise LaunchError(f"{self._source.path}: expected frames, but none of {len(self._source)} could be read")
         self.diagnosis.end()
         self.diagnosis.answer(len(self._asked), self._given)
-
-    @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """(T,) stamps of the input, nanoseconds."""
-        return np.array(self._stamps_ns, np.int64)
-
-    @property
-    def bodies(self) -> tuple[int, ...]:
-        """Ids along the input's axis of bodies; none if it has no such axis, or if the prior assigns ids itself."""
-        return self._source.bodies if isinstance(self._source, ArraySource) and not self._identifies else ()
 
     @property
     def refused(self) -> Counter[str]:
@@ -207,15 +205,12 @@ class OfflineRun:
         return Counter({cause: n for cause, n in counted.items() if n})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Process the whole source. Returns the arrays of `NpzCollector`, one row per input frame.
-
-        Raises:
-            LaunchError: no frame could be read.
+        """Process the whole source. Returns the arrays of `NpzCollector`, one row per input frame, and with the input's
+        axis of bodies, unless the prior assigns ids itself.
         """
-        collector = NpzCollector(self, self.bodies)
-        if not self._stamps_ns:
-            raise LaunchError(f"expected frames, but none of {len(self._source)} could be read")
-        return collector.arrays(self.stamps_ns)
+        bodies = self._source.bodies if isinstance(self._source, ArraySource) and not self._identifies else ()
+        collector = NpzCollector(self, bodies)
+        return collector.arrays(np.array(self.stamps_ns, np.int64))
 
 
 def clean_joints(joints: Floats, delay: int = 8) -> Floats:

@@ -73,14 +73,13 @@ def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
 
 def complete_source(
     frames: RecordedSource,
-    name: str,
     fill: Fill,
     uncertainty: Uncertainty,
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[int], None] = lambda frame: None,
     seed: int | None = None,
 ) -> CompletedSource:
-    """Complete a source. ``name`` is its name in errors; the other arguments are those of `complete_raws`.
+    """Complete a source. The other arguments are those of `complete_raws`.
 
     Raises:
         LaunchError: no frame could be read.
@@ -88,8 +87,8 @@ def complete_source(
     """
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
-        raise LaunchError(f"{name}: expected frames, but none of {len(frames)} could be read")
-    completion = complete_raws(name, raws[:-1], fill, uncertainty, began, advanced, seed)
+        raise LaunchError(f"{frames.path}: expected frames, but none of {len(frames)} could be read")
+    completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, began, advanced, seed)
     settings = TrajectorySettings()
     world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
     answers: list[tuple[str, Message]] = []
@@ -104,8 +103,7 @@ def complete_source(
 
 def _problems(raws: Sequence[PoseRaw]) -> list[str]:
     """The problems with the joints of a stream that has ended, as texts; its stamps are not checked."""
-    few = raws[: -1 : max(len(raws) // CHECKED, 1)]
-    return [f"{problem.cause}: {problem.text}" for problem in check_geometry(few)]
+    return list(map(str, check_geometry(raws[: -1 : max(len(raws) // CHECKED, 1)])))
 
 
 class Fitted(NamedTuple):
@@ -137,7 +135,6 @@ def load_transitions(weights: str) -> HumorNet:
 
 def fit_source(
     frames: RecordedSource,
-    name: str,
     points: ArrayLike | None,
     *,
     model: HumorNet,
@@ -150,7 +147,6 @@ def fit_source(
 
     Args:
         frames: the source.
-        name: its name in errors.
         points: (T, N, 3) metres, points on the body's surface in the sensor's frame; padded with NaN.
         delay: delay of the initial estimate, frames at 30 Hz.
         model, folder, began, advanced: as in `prior.fit.bodies.fit_stream`.
@@ -164,13 +160,13 @@ def fit_source(
     from steadypose.prior.fit.bodies import fit_stream, rewritten
     from steadypose.prior.fit.windows import MIN_FRAMES
 
-    surface = None if points is None else _surface(name, np.asarray(points), len(frames))
+    surface = None if points is None else _surface(frames, np.asarray(points))
     messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
     fits = fit_stream(messages, surface, model, folder, began, advanced)
     if not fits:
         raise LaunchError(
-            f"{name}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the skeleton "
-            "right, are the units metres? `steadypose info` says what it holds"
+            f"{frames.path}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the "
+            "skeleton right, are the units metres? `steadypose info` says what it holds"
         )
     raws = [message for _, message in messages if isinstance(message, PoseRaw)]
     stamps = np.array([raw.stamp_ns for raw in raws if not raw.end_of_stream], np.int64)
@@ -185,11 +181,11 @@ def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str,
     return arrays | {"bone_lengths": bones, "ground_plane": ground_plane(track.ground.mean(axis=0))}
 
 
-def _surface(name: str, points: NDArray[Any], frames: int) -> Floats:
+def _surface(frames: RecordedSource, points: NDArray[Any]) -> Floats:
     """(T, N, 3) metres, without points at an impossible distance from the camera."""
-    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != frames or points.shape[-1] != 3:
+    if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != len(frames) or points.shape[-1] != 3:
         raise NpzError(
-            f"{name}: points: expected ({frames}, N, 3) metres, NaN for what is missing, got {points.dtype} "
-            f"{points.shape}"
+            f"{frames.path}: points: expected ({len(frames)}, N, 3) metres, NaN for what is missing, got "
+            f"{points.dtype} {points.shape}"
         )
     return in_sight(points.astype(np.float64))

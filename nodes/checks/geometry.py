@@ -60,10 +60,7 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
             "an array, NaN says the same, and this can be ignored",
         )
         return
-    if (problem := _degenerate(messages, joints)) is not None:
-        yield problem
-        return
-    if (problem := _zeros(skeleton, joints)) is not None:
+    if (problem := _degenerate(messages, joints) or _zeros(skeleton, joints)) is not None:
         yield problem
         return
     like = likeness(skeleton, joints)

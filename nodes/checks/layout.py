@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -276,11 +276,6 @@ def stamps_hint(stamps: NDArray[Any], frames: int) -> str:
                 return f"; these seem to be {unit}: np.round(stamps * {factor:.0e}).astype(np.int64)"
         return "; whole numbers: np.round(stamps).astype(np.int64)"
     return ""
-
-
-def frames_hint(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """A hint for arrays without stamps or frame rate."""
-    return ": of a regular stream give fps, 30 for instance" if "positions" in arrays else ""
 
 
 def _with_joints(count: int) -> list[str]:

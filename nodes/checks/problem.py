@@ -1,13 +1,10 @@
-"""Shared by all checks: `Problem`, as reported by `diagnostics`, the console and `steadypose doctor --live`, and
-`Window`, the last messages of a stream.
-"""
+"""Shared by all checks: `Problem`, as reported by `diagnostics`, the console and `steadypose doctor --live`."""
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +27,9 @@ class Problem:
     text: str
     """what was received, what was expected, and what to do"""
 
+    def __str__(self) -> str:
+        return f"{self.cause}: {self.text}"
+
 
 def error(cause: str, text: str) -> Problem:
     return Problem(Level.ERROR, cause, text)
@@ -49,43 +49,8 @@ def from_values(values: Mapping[str, str]) -> dict[str, str]:
     return {key.removeprefix(PREFIX): text for key, text in values.items() if key.startswith(PREFIX)}
 
 
-LENGTH_NS = 1_500_000_000
-"""Length of the window, nanoseconds."""
-LONGEST = 90
-"""Largest number of messages in the window."""
 JUDGED = 4
 """Largest number of bodies per message whose joints are examined."""
-
-
-class Arrival(NamedTuple):
-    """A message, and the wall time of its arrival in nanoseconds since 1970."""
-
-    at_ns: int
-    raw: PoseRaw
-
-
-class Window:
-    """The messages of the last `LENGTH_NS`, with their times of arrival."""
-
-    def __init__(self) -> None:
-        self._arrivals: deque[Arrival] = deque(maxlen=LONGEST)
-        self.received = 0
-        """number of messages received so far"""
-        self.inhabited = 0
-        """number of messages with at least one body so far"""
-
-    def add(self, raw: PoseRaw, at_ns: int) -> None:
-        self.received += 1
-        self.inhabited += bool(raw.bodies)
-        self._arrivals.append(Arrival(at_ns, raw))
-
-    def arrivals(self, now_ns: int) -> list[Arrival]:
-        """The arrivals in the window that ends at ``now_ns``, oldest first."""
-        return [arrival for arrival in self._arrivals if now_ns - arrival.at_ns <= LENGTH_NS]
-
-    @property
-    def last(self) -> Arrival | None:
-        return self._arrivals[-1] if self._arrivals else None
 
 
 def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.msgs.types import Level
-from steadypose.nodes.checks.problem import Arrival, Problem, error, warning
+from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.prior.timing.rate import FPS
 
 SECOND_NS = 1_000_000_000
@@ -32,11 +33,11 @@ SETTLED = 8
 """Smallest number of messages before and after such a step."""
 
 
-def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem]:
-    """Problems with the stamps of a window; if ``live``, they should also be close to the present."""
-    if len(arrivals) < ENOUGH:
+def check_stamps(stamps: NDArray[np.int64], arrived: NDArray[np.int64] | None) -> Iterator[Problem]:
+    """Problems with the stamps (T,) of a window, nanoseconds. Those of a live stream should also be close to the wall
+    times (T,) at which they ``arrived``; None for another."""
+    if len(stamps) < ENOUGH:
         return
-    stamps = np.array([arrival.raw.stamp_ns for arrival in arrivals])
     if (problem := _unit(stamps)) is not None:
         yield problem
         return
@@ -73,8 +74,8 @@ def check_stamps(arrivals: Sequence[Arrival], *, live: bool) -> Iterator[Problem
             f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, "
             "ideally 30; fast motion is lost: use a smaller network or smaller images",
         )
-    if live:
-        yield from _against_clock(arrivals, stamps)
+    if arrived is not None:
+        yield from _against_clock(arrived - stamps)
 
 
 def check_back(back_ns: int) -> Iterator[Problem]:
@@ -99,7 +100,7 @@ def check_length(span_ns: int, delay_frames: int) -> Iterator[Problem]:
         )
 
 
-def _unit(stamps: np.ndarray) -> Problem | None:
+def _unit(stamps: NDArray[np.int64]) -> Problem | None:
     """The problem with stamps that are not nanoseconds."""
     newest, rising = int(stamps[-1]), np.diff(stamps)
     if not stamps.any():
@@ -149,9 +150,8 @@ def _of_unit(unit: str, found: str, factor: float) -> Problem:
     )
 
 
-def _against_clock(arrivals: Sequence[Arrival], stamps: np.ndarray) -> Iterator[Problem]:
-    """Problems with the offset between stamps and this machine's clock."""
-    late = np.array([arrival.at_ns for arrival in arrivals]) - stamps
+def _against_clock(late: NDArray[np.int64]) -> Iterator[Problem]:
+    """Problems with the offset between this machine's clock and the stamps, nanoseconds."""
     if -late.max() > AHEAD_NS:
         yield warning(
             "stamps_ahead",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ import numpy as np
 from steadypose.msgs.types import Level, PoseClean, PoseRaw
 from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_speed
 from steadypose.nodes.checks.layout import check_layout
-from steadypose.nodes.checks.problem import Problem, Window, error, some_bodies, warning
+from steadypose.nodes.checks.problem import Problem, error, some_bodies, warning
 from steadypose.nodes.checks.stamps import check_stamps
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -72,6 +72,10 @@ class Answers:
         self._in = self._out = self._joints = self._flagged = 0
 
 
+LENGTH_NS = 1_500_000_000
+"""Length of the window of messages that are examined, nanoseconds."""
+LONGEST = 90
+"""Largest number of messages in the window."""
 SILENT_NS = 2_000_000_000
 """Time without a message after which a stream counts as stopped, nanoseconds."""
 AT_ONCE = 4
@@ -81,22 +85,30 @@ NOBODY = 60
 
 
 class StreamCheck:
-    """Checks a stream of ``pose/raw`` for misuse, for a prior of these settings."""
+    """Checks a stream of ``pose/raw`` for misuse, for a prior of these settings.
+
+    Attributes:
+        received: number of messages so far.
+        inhabited: number of messages with at least one body so far.
+        examined_ns: wall time of the last examination, nanoseconds; -1: never.
+    """
 
     def __init__(self, settings: PriorSettings) -> None:
         self._settings = settings
-        self._window = Window()
+        self._arrivals: deque[tuple[int, PoseRaw]] = deque(maxlen=LONGEST)
+        self.received = self.inhabited = 0
         self._heard_ns = 0
         self._ended = False
         self._found: list[Problem] = []
         self.examined_ns = -1
-        """wall time of the last examination, nanoseconds; -1: never"""
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
         """Record a message that arrived at wall time ``at_ns``."""
         self._ended = raw.end_of_stream
         if not raw.end_of_stream:
-            self._window.add(raw, at_ns)
+            self.received += 1
+            self.inhabited += bool(raw.bodies)
+            self._arrivals.append((at_ns, raw))
 
     def heard(self, at_ns: int) -> None:
         """Record that a message arrived and was dropped unread because the node was late."""
@@ -106,12 +118,11 @@ class StreamCheck:
         """The stream's current problems at wall time ``now_ns``; if ``live``, it should go on in real time. The
         messages are examined only if ``anew``; otherwise the last result is returned.
         """
-        last = self._window.last
-        if last is None or self._ended:
+        if not self._arrivals or self._ended:
             return []
-        if live and (silent_ns := now_ns - max(last.at_ns, self._heard_ns)) > SILENT_NS:
+        if live and (silent_ns := now_ns - max(self._arrivals[-1][0], self._heard_ns)) > SILENT_NS:
             text = (
-                f"no message for {silent_ns / 1e9:.0f} s, after message {self._window.received}: the tracker has "
+                f"no message for {silent_ns / 1e9:.0f} s, after message {self.received}: the tracker has "
                 "stopped, hangs, or lost its connection; restart it, and the stream continues"
             )
             return [error("stopped", text)]
@@ -124,17 +135,18 @@ class StreamCheck:
         return self._found
 
     def _problems(self, now_ns: int, live: bool) -> Iterator[Problem]:
-        arrivals = self._window.arrivals(now_ns)
-        messages = [arrival.raw for arrival in arrivals]
+        arrivals = [(at_ns, raw) for at_ns, raw in self._arrivals if now_ns - at_ns <= LENGTH_NS]
+        messages = [raw for _, raw in arrivals]
         if not messages:
             return
-        stamps = list(check_stamps(arrivals, live=live))
+        times_ns = np.array([at_ns for at_ns, _ in arrivals]) if live else None
+        stamps = list(check_stamps(np.array([raw.stamp_ns for raw in messages]), times_ns))
         names = list(check_layout(messages, self._settings))
         yield from (*stamps, *names)
-        if not self._window.inhabited and self._window.received >= NOBODY:
+        if not self.inhabited and self.received >= NOBODY:
             yield warning(
                 "nobody",
-                f"{self._window.received} messages, none with a body: expected bodies; if people are in view, the "
+                f"{self.received} messages, none with a body: expected bodies; if people are in view, the "
                 "tracker does not detect them, or the publisher leaves `bodies` empty",
             )
         if not _usable(names):  # with a wrong layout, checks of joints mean nothing

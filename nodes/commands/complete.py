@@ -96,7 +96,6 @@ def complete(
         def completion_of(seed: int | None) -> CompletedSource:
             return complete_source(
                 open_recording(source, read_toml(rig) if rig else NO_RIG),
-                str(source),
                 fill,
                 uncertainty,
                 began=lambda frames: progress.update(bar, total=frames),

@@ -114,7 +114,7 @@ def _fit_poses(
     bar = progress.add_task(source.name, total=None)
     points = read_arrays(source, ("points",)).get("points") if source.suffix == ".npz" else None
     fitted = fit_source(
-        open_recording(source), str(source), points, model=model, delay=delay, folder=folder,
+        open_recording(source), points, model=model, delay=delay, folder=folder,
         began=lambda bodies: progress.update(bar, total=sum(len(window_bounds(len(b.bodies))) for b in bodies)),
         advanced=lambda: progress.advance(bar),
     )  # fmt: skip

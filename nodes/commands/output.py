@@ -22,9 +22,9 @@ from rich.console import Console
 
 from steadypose.msgs.recording import RecordingError, RecordingWriter
 from steadypose.msgs.recording_writer import recorded_parts
-from steadypose.msgs.types import Message, PoseRaw
+from steadypose.msgs.types import Message
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.arrays import NpzCollector, write_csv, write_events
+from steadypose.nodes.sinks.arrays import write_csv, write_events
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.timeline import EventTimeline
@@ -214,19 +214,10 @@ def clean_recording(
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source, settings.get("rig", {}))
     timeline = EventTimeline(build_settings(EventSettings, settings.get("events", {}), "events")) if events else None
-    run = OfflineRun(frames, settings, timeline)
+    run = OfflineRun(frames, settings, timeline, advanced)
     began(len(frames))
     started = time.perf_counter()
-
-    def messages() -> Iterator[tuple[str, Message]]:
-        for topic, message in run:
-            yield topic, message
-            if isinstance(message, PoseRaw) and not message.end_of_stream:
-                advanced()
-        if not len(run.stamps_ns):
-            raise LaunchError(f"{source}: expected frames, but none of {len(frames)} could be read")
-
-    write_output(out, lambda: NpzCollector(messages(), run.bodies).arrays(run.stamps_ns), messages)
+    write_output(out, run.arrays, lambda: run)
     if events and timeline:
         with unfinished(events) as part:
             write_events(part, timeline.events())

@@ -277,7 +277,7 @@ def complete(
     from steadypose.nodes.offline import complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    completed = complete_source(source, "positions", *load_completer(weights), seed=seed)
+    completed = complete_source(source, *load_completer(weights), seed=seed)
     warn(completed.problems)
     return Poses(completed.arrays(), completed.problems, completed.refused)
 
@@ -322,7 +322,7 @@ def fit(
     from steadypose.nodes.offline import fit_source, load_transitions
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    fitted = fit_source(source, "positions", points, model=load_transitions(weights), delay=delay)
+    fitted = fit_source(source, points, model=load_transitions(weights), delay=delay)
     problems = [f"body {fit.seen.id}: not explained, left as `clean` has it" for fit in fitted.fits if not fit.track]
     problems += fitted.problems
     warn(problems)

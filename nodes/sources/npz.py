@@ -34,7 +34,7 @@ from steadypose.msgs.types import (
     Tracking,
     WorldBody,
 )
-from steadypose.nodes.checks.layout import axes_hint, count_hint, frames_hint, skeleton_hint, stamps_hint
+from steadypose.nodes.checks.layout import axes_hint, count_hint, skeleton_hint, stamps_hint
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.clean.admission import MAX_DISTANCE
@@ -289,7 +289,8 @@ def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> 
         if frames / fps.item() * 1e9 >= STAMPS_END_NS:
             raise NpzError(f"{path}: fps: {frames} frames at {fps.item():g} a second last longer than stamps can hold")
         return np.round(np.arange(frames) * (1e9 / float(fps.item()))).astype(np.int64)
-    raise NpzError(f"{path}: expected stamp_ns (T,), nanoseconds of capture, or fps; got neither{frames_hint(arrays)}")
+    hint = ": of a regular stream give fps, 30 for instance" if "positions" in arrays else ""
+    raise NpzError(f"{path}: expected stamp_ns (T,), nanoseconds of capture, or fps; got neither{hint}")
 
 
 SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")

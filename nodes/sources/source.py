@@ -116,6 +116,8 @@ class WebcamSettings:
 class RecordedSource(Protocol):
     """Recorded messages in order, each with its topic: ``pose/raw``, and ``pose/truth`` if the recording has it."""
 
+    path: Path
+    """the file, or a name in errors"""
     refused: Counter[str]
     """number of messages that could not be read, by cause"""
 

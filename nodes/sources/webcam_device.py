@@ -271,6 +271,7 @@ class VideoSource:
         make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
         image_file: Path | None = None,
     ) -> None:
+        self.path = Path(settings.video)
         self.refused: Counter[str] = Counter()
         self._settings, self._calibration, self._make_landmarker = settings, calibration, make_landmarker
         self._image_file = image_file
@@ -285,7 +286,7 @@ class VideoSource:
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         video = cv2.VideoCapture(self._settings.video)
-        name = Path(self._settings.video).stem
+        name = self.path.stem
         try:
             with (
                 self._make_landmarker(self._settings) as landmarker,

@@ -402,7 +402,7 @@ def test_a_recording_most_of_whose_frames_give_no_pose_is_not_trusted(joints: np
     run = OfflineRun(source_of(joints, stamp_ns=stamps), sections(None, 4))
     run.arrays()
     assert not run.diagnosis.trusted
-    assert run.diagnosis.problems["few_poses"].startswith(f"2 of {FRAMES} frames with a body gave a pose")
+    assert run.diagnosis.problems["few_poses"].text.startswith(f"2 of {FRAMES} frames with a body gave a pose")
 
 
 def test_a_misspelt_array_is_named(tmp_path: Path, joints: np.ndarray, capsys: pytest.CaptureFixture[str]) -> None:
