@@ -28,7 +28,7 @@ from steadypose.nodes.commands.output import plural
 from steadypose.nodes.graph.clock import POLL_S
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings, publishers
-from steadypose.nodes.settings import STREAMS, located, printable
+from steadypose.nodes.settings import STREAMS, LaunchError, located, printable
 from steadypose.prior.settings import nearest
 
 PATIENCE_S = 3.0
@@ -39,23 +39,19 @@ LaunchFile = Annotated[str | None, tyro.conf.arg(metavar="FILE")]
 Address = Annotated[tuple[str, ...], tyro.conf.arg(name="endpoint", metavar="ADDRESS")]
 
 
-class InspectError(ValueError):
-    """No such topic or recording. The text says what there is."""
-
-
 def messages_of(
     target: str, topics: tuple[str, ...], launch: str | None, endpoints: tuple[str, ...], *, newest: bool = False
 ) -> Iterator[tuple[str, Message]]:
     """What comes on a topic until Ctrl-C, if ``newest`` without what could not be taken in time; or a recording's."""
     if target in TOPICS:
         if topics:
-            raise InspectError(f"--topic chooses from a recording; {target} is a topic itself")
+            raise LaunchError(f"--topic chooses from a recording; {target} is a topic itself")
         with subscribe(target, launch, endpoints, conflate=newest) as subscriber:
             yield from receive(subscriber, target)
         return
     for topic in topics:
         if topic not in TOPICS:
-            raise InspectError(f"no topic {topic!r}{nearest(topic, TOPICS)}; there are {', '.join(TOPICS)}")
+            raise LaunchError(f"no topic {topic!r}{nearest(topic, TOPICS)}; there are {', '.join(TOPICS)}")
     with RecordingReader(recording_at(target)) as recording:
         for topic, _, message in recording.messages(topics or None):
             yield topic, message
@@ -64,7 +60,7 @@ def messages_of(
 def recording_at(target: str) -> Path:
     path = located(target, Path(), STREAMS)
     if not path.exists():
-        raise InspectError(f"no topic or recording {target!r}{nearest(target, TOPICS)}; topics are {', '.join(TOPICS)}")
+        raise LaunchError(f"no topic or recording {target!r}{nearest(target, TOPICS)}; topics are {', '.join(TOPICS)}")
     return path
 
 

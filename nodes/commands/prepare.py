@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -16,15 +16,12 @@ from rich.progress import Progress
 from rich.table import Table
 
 from steadypose.nodes.graph.launch import read_toml
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.mocap.clip import Clip, MotionError, documented
 from steadypose.prior.mocap.files import SUFFIXES, describe
 from steadypose.training.data.datasets import DATA_SETS, SPLITS, DataSet
 from steadypose.training.data.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
 from steadypose.training.data.readers import UNREADABLE, Dropped, read_own
-
-
-class PrepareError(ValueError):
-    """There is nothing to prepare; the message says what was looked for."""
 
 
 def prepare(
@@ -80,7 +77,7 @@ def prepare(
     prepared = [part for part in found if isinstance(part, Prepared)]
     dropped = [part for part in found if isinstance(part, Dropped)]
     if not prepared:
-        raise PrepareError(f"nothing usable in {mocap}; dropped: {len(dropped)}")
+        raise LaunchError(f"nothing usable in {mocap}; dropped: {len(dropped)}")
     out.mkdir(parents=True, exist_ok=True)
     write_prepared(prepared, out / "prepared.npz")
     report = out / "prepare-report.json"
@@ -99,17 +96,17 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
     """Which files hold which known data set, in the order of preparation.
 
     Raises:
-        PrepareError: nothing there, or nothing known.
+        LaunchError: nothing there, or nothing known.
     """
     if not mocap.exists():
-        raise PrepareError(f"expected a folder or archive of motion capture, '{mocap}' does not exist")
+        raise LaunchError(f"expected a folder or archive of motion capture, '{mocap}' does not exist")
     candidates = [mocap] if mocap.is_file() else [*sorted(mocap.iterdir()), mocap]
     found = [(path, s) for s in DATA_SETS for path in candidates if s.matches(path)]
     if not found and any(path.suffix in SUFFIXES for path in ([mocap] if mocap.is_file() else mocap.rglob("*"))):
         found = [(mocap, s) for s in DATA_SETS if s.name == "own"]
     if not found:
         known = ", ".join(s.files.removesuffix(r"\b.*") for s in DATA_SETS)
-        raise PrepareError(f"expected files named {known} in '{mocap}', found none")
+        raise LaunchError(f"expected files named {known} in '{mocap}', found none")
     return found
 
 
@@ -168,18 +165,13 @@ def _read(path: Path, data_set: DataSet, speeds: Sequence[float], progress: Prog
         told = f"{len(kept)} recordings, {sum(kept) / 60:.1f} min, {len(found) - len(kept)} dropped"
         progress.update(task, completed=fraction, description=f"{path.name}: {told}")
 
-    for clip in _clips(path, data_set, advance):
-        found += [clip] if isinstance(clip, Dropped) else _prepared(clip, data_set, speeds)
+    try:
+        for clip in data_set.read(path, advance):
+            found += [clip] if isinstance(clip, Dropped) else _prepared(clip, data_set, speeds)
+    except MotionError as error:  # its archive cannot be read further
+        found.append(Dropped(path.name, data_set.name, UNREADABLE, str(error)))
     advance(1.0)
     return found
-
-
-def _clips(path: Path, data_set: DataSet, advance: Callable[[float], None]) -> Iterator[Clip | Dropped]:
-    """The recordings of a data set; where its archive cannot be read further, that is the last."""
-    try:
-        yield from data_set.read(path, advance)
-    except MotionError as error:
-        yield Dropped(path.name, data_set.name, UNREADABLE, str(error))
 
 
 def _prepared(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> list[Prepared | Dropped]:

@@ -16,7 +16,8 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
 from steadypose.nodes.commands import info as info_module
 from steadypose.nodes.commands.info import info
-from steadypose.nodes.commands.inspect import InspectError, Rate, echo, hz, measure
+from steadypose.nodes.commands.inspect import Rate, echo, hz, measure
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import end_of
 
 DEADLINE_S = 20.0
@@ -175,5 +176,5 @@ def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
     ],
 )
 def test_what_is_not_there_is_named(recording: Path, command: Callable[[str], None], expected: str) -> None:
-    with pytest.raises(InspectError, match=expected):
+    with pytest.raises(LaunchError, match=expected):
         command(str(recording))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tests.training.data.test_motion_datasets import idle_bvh, pack, unpack
 
-from steadypose.nodes.commands.prepare import PrepareError, find_sources, prepare
+from steadypose.nodes.commands.prepare import find_sources, prepare
+from steadypose.nodes.settings import LaunchError
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
@@ -210,13 +211,13 @@ def test_preparing_twice_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytes
 
 
 def test_nothing_to_prepare_says_what_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(PrepareError, match="does not exist"):
+    with pytest.raises(LaunchError, match="does not exist"):
         find_sources(tmp_path / "nowhere")
     (tmp_path / "walk.fbx").write_bytes(b"")
-    with pytest.raises(PrepareError, match=r"cmu_amc.*ui_prmd"):
+    with pytest.raises(LaunchError, match=r"cmu_amc.*ui_prmd"):
         find_sources(tmp_path)
     unpack(tmp_path / "own", {"1.bvh": "no"})
-    with pytest.raises(PrepareError, match="nothing usable"):
+    with pytest.raises(LaunchError, match="nothing usable"):
         prepare(tmp_path, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
