@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import matplotlib
 import numpy as np
@@ -36,10 +36,6 @@ from steadypose.prior.camera.calibration import (
     floor_pose,
     points_of_depth,
 )
-
-if TYPE_CHECKING:
-    from steadypose.nodes.sources.oak_device import Still
-
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9)}
 GOOD_SIGMA_M = 0.005
@@ -262,9 +258,6 @@ class CalibrateOak:
             still = capture_with_camera(launch.settings(InputSettings).oak)
         except RuntimeError as error:
             raise CalibrationError(str(error)) from error
-        self._write(still)
-
-    def _write(self, still: Still) -> None:
         image, depth = self.out.with_name(f"{self.out.name}.png"), self.out.with_name(f"{self.out.name}.depth.png")
         write_image(image, still.colour)
         write_image(depth, still.depth)

@@ -15,6 +15,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
+from steadypose.nodes.commands.output import unfinished
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import VIDEOS
@@ -180,12 +181,7 @@ def save_calibration(path: Path, *, lens: Intrinsics | None = None, pose: Pose |
     if pose:
         section["position"] = [round(float(value), 5) for value in pose.position]
         section["orientation"] = [round(float(value), 7) for value in pose.orientation]
-    # the user's own file: whole, as it was or as it becomes, whatever happens in between
-    part = path.with_name(f".{path.name}.part")
-    try:
+    with unfinished(path.resolve()) as part:  # the user's own file
         part.write_text(tomlkit.dumps(document), encoding="utf-8")
         shutil.copymode(path, part)
         Launch.read(part)
-        part.replace(path.resolve())
-    finally:
-        part.unlink(missing_ok=True)

@@ -83,7 +83,7 @@ def listen(launch_file: str, console: Console) -> int:
     from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
     from steadypose.msgs.transport import Subscriber
     from steadypose.msgs.types import Diagnostics, PoseRaw
-    from steadypose.nodes.checks.problem import error, from_values
+    from steadypose.nodes.checks.problem import check_wire, error, from_values
     from steadypose.nodes.checks.stream import StreamCheck
     from steadypose.nodes.graph.clock import POLL_S, Clock
     from steadypose.nodes.graph.launch import Launch
@@ -109,18 +109,10 @@ def listen(launch_file: str, console: Console) -> int:
             while received := nodes.receive(0):
                 if isinstance(news := received[1], Diagnostics):
                     reported |= {cause: f"{news.node}: {text}" for cause, text in from_values(news.values).items()}
-        refused = sum(tracker.refused.values())
+        refused = tracker.refused
     # a replay's stamps are long past, and so is what a tracker's may be: neither says that they should be of now
-    problems = check.problems(clock.now_ns(), live=False)
-    if not frames and refused:
-        problems.append(
-            error(
-                "not_a_message",
-                f"nothing that came is a valid message ({refused} refused): expected the topic, a zero byte, a header "
-                "of 17 bytes, and CDR (docs/other_languages.md)",
-            )
-        )
-    elif not frames:
+    problems = [*check.problems(clock.now_ns(), live=False), *check_wire(refused)]
+    if not frames and not problems:
         problems.append(
             error(
                 "no_source",
@@ -129,7 +121,7 @@ def listen(launch_file: str, console: Console) -> int:
             )
         )
     for problem in problems:
-        console.print(f"{problem.level.name} {problem.cause}: {problem.text}", markup=False, soft_wrap=True)
+        console.print(f"{problem.level.name} {problem}", markup=False, soft_wrap=True)
     for cause, text in reported.items():
         if cause not in {problem.cause for problem in problems}:
             console.print(f"{cause}: {text}", markup=False, soft_wrap=True)

@@ -123,16 +123,16 @@ MODELS = ("mixture", "hgvae", "occlusion", "trajectory", "contacts")
 FRAMES, WARM_UP = 100, 20
 FRAME_NS = 1_000_000_000 / 30
 TARGET_MS, BUDGET_MS = 10.0, 1000 / 30
-LONGEST_IPC_PATH = 107  # bytes of a unix socket's path that the system takes
 
 
 def check_messages() -> Iterator[Finding]:
     """The directory of the ipc sockets, and a message there and back."""
+    import zmq
+
     from steadypose.nodes.graph.topology import TransportSettings
 
     directory = TransportSettings().ipc_directory
-    longest = len(os.fsencode(directory / "trajectory"))
-    if longest > LONGEST_IPC_PATH:
+    if len(os.fsencode(directory / "trajectory")) > zmq.IPC_PATH_MAX_LEN:
         fix = "set XDG_RUNTIME_DIR, or [transport] directory in the launch file, to a shorter path"
         yield Finding("messages", Verdict.BAD, f"{directory} is too long a path for sockets", fix)
         return

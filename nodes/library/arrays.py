@@ -71,11 +71,6 @@ def suggesting(function: Callable[P, R]) -> Callable[P, R]:
     return checked
 
 
-def compile_loops() -> None:
-    """Compile the loops that are not in the cache, and log progress: a minute of silence would look like a hang."""
-    compile_missing(logger.warning)
-
-
 def warn(texts: Iterable[str]) -> None:
     """Issue each text as an `InputWarning` at the caller's line."""
     for text in texts:
@@ -232,7 +227,7 @@ def clean(
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     checked = sections(settings, delay)
     timeline = EventTimeline(build_settings(EventSettings, checked["events"], "events"))
-    compile_loops()
+    compile_missing(logger.warning)  # a minute of silence would look like a hang
     run = OfflineRun(source, checked, timeline)
     arrays = run.arrays()
     warn(run.diagnosis.texts)

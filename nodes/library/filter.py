@@ -17,13 +17,14 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.checks.layout import axes_hint, check_sensor_pose, skeleton_hint
 from steadypose.nodes.driving import CHECKED, Diagnosis
+from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
 from steadypose.nodes.library.arrays import (
     SkeletonLike,
     as_array,
-    compile_loops,
+    logger,
     sections,
     skeleton_name,
     suggesting,
@@ -88,7 +89,7 @@ class Filter:
         event_settings = build_settings(EventSettings, given["events"], "events")
         self._frame_events = FrameEvents(event_settings) if events else None
         self.events: tuple[TimedEvent, ...] = ()
-        compile_loops()
+        compile_missing(logger.warning)
         prior = given["prior"]
         self._prior, self._trajectory = make_prior(prior), make_trajectory(given["trajectory"])
         one_thread()
