@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,19 +79,13 @@ class EventTimeline:
 
     def __init__(self, settings: EventSettings | None = None) -> None:
         self._frames = FrameEvents(settings)
-        self._events: list[TimedEvent] = []
-        self._newest: dict[_Key, int] = {}
+        self._events: dict[tuple[Any, ...], TimedEvent] = {}
 
     def add(self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False) -> None:
         """Add the next message of ``pose/world``; arguments as of `FrameEvents.update`."""
         for event in self._frames.update(world, sensor, calibrated=calibrated):
-            key = event[:3]
-            if event.phase == Phase.BEGINS:
-                self._newest[key] = len(self._events)
-                self._events.append(event)
-            else:
-                self._events[self._newest[key]] = event
+            self._events[event.body, event.kind, event.hand, event.begin_ns] = event
 
     def events(self) -> list[TimedEvent]:
         """All events so far, by begin. Those that have not ended last until the newest message."""
-        return sorted(self._events, key=lambda event: (event.begin_ns, event.body))
+        return sorted(self._events.values(), key=lambda event: (event.begin_ns, event.body))

@@ -123,47 +123,37 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
         if job.replace or not os.path.lexists(job.out):
             manifest.add(job, {"state": "started"})
     cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
-    outcomes = Counter(outcome(result) for result in done.values())
+    outcomes = Counter(outcome(job, result)[0] for job, result in done.items())
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(folder.name, total=len(found), completed=len(done))
         for job, result in cleaning:
             manifest.add(job, result)
             progress.advance(bar)
-            outcomes[outcome(result)] += 1
             for problem in result.get("problems", ()):
                 console.print(f"{job.source}: {problem}", style="yellow")
-            if fault := _fault(job, result):
-                console.print(f"{job.source}: {fault}", style="red")
+            became, why = outcome(job, result)
+            outcomes[became] += 1
+            if why:
+                console.print(f"{job.source}: {why}", style="red")
     others = ", ".join(f"{count} {what}" for what, count in outcomes.items() if what != CLEAN)
     console.print(f"{out}: {outcomes[CLEAN]} of {len(found)} recordings are clean{others and f'; {others}'}")
     return 0 if outcomes[CLEAN] == len(found) else 1
 
 
-CLEAN, FAILED, EMPTY, DAMAGED, DOUBTFUL = "clean", "failed", "without anybody in it", "damaged", "not to be trusted"
-"""what may become of a recording"""
+CLEAN = "clean"
 
 
-def outcome(result: Mapping[str, Any]) -> str:
-    """What became of a recording, by its entry in the manifest."""
+def outcome(job: Job, result: Mapping[str, Any]) -> tuple[str, str]:
+    """What became of a recording, by its entry in the manifest; and why it is not clean, empty if it is."""
     if result["state"] == "failed":
-        return FAILED
+        return "failed", result["error"].removeprefix(f"{job.source}: ")
     if not result["poses"]:
-        return EMPTY
+        return "without anybody in it", NO_POSE
     if result["unread"]:
-        return DAMAGED
-    return CLEAN if result.get("trusted", True) else DOUBTFUL  # earlier versions did not note it
-
-
-def _fault(job: Job, result: Mapping[str, Any]) -> str:
-    """Why a recording is not clean; empty if it is."""
-    damage = ", ".join(f"{cause}: {n}" for cause, n in result.get("unread", {}).items())
-    return {
-        CLEAN: "",
-        FAILED: str(result.get("error")).removeprefix(f"{job.source}: "),
-        EMPTY: NO_POSE,
-        DAMAGED: f"damaged; {damage}",
-        DOUBTFUL: UNTRUSTED,
-    }[outcome(result)]
+        return "damaged", "damaged; " + ", ".join(f"{cause}: {n}" for cause, n in result["unread"].items())
+    if not result.get("trusted", True):  # earlier versions did not note it
+        return "not to be trusted", UNTRUSTED
+    return CLEAN, ""
 
 
 class Manifest:

@@ -88,7 +88,9 @@ def train(
     join()
     set_threads(threads)
     name = weights or ("kinect_v2" if model == "correction" else "default")
-    if name not in (sets := _weight_sets(model)):
+    of_default_alone = model in ("mixture", "body_modes", "occlusion")
+    sets = ("kinect_v2",) if model == "correction" else ("default",) if of_default_alone else get_args(WeightSet)
+    if name not in sets:
         raise LaunchError(f"--weights: expected {' or '.join(sets)} for {model}, got {name}")
     if start is not None and model == "correction":
         raise LaunchError("--start: a correction is trained from the beginning, in minutes; leave it out")
@@ -102,13 +104,6 @@ def train(
     path = getattr(import_module(f"steadypose.training.recipes.{recipe}"), function)(options)
     if writes():
         print(f"weights: {install_weights(path) if install else path}")
-
-
-def _weight_sets(model: str) -> tuple[str, ...]:
-    """The sets of weights that a model can be trained for."""
-    if model == "correction":
-        return ("kinect_v2",)
-    return ("default",) if model in ("mixture", "body_modes", "occlusion") else get_args(WeightSet)
 
 
 def little_data(path: Path, weights: str) -> str:
