@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
@@ -16,8 +17,9 @@ import pytest
 from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.recording import RecordingWriter
-from steadypose.msgs.topics import POSE_RAW
-from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
+from steadypose.msgs.transport import Publisher
+from steadypose.msgs.types import Pose, PoseClean, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
@@ -173,6 +175,23 @@ def repeated(act: Callable[[], object]) -> Iterator[None]:
     finally:
         over.set()
         thread.join(20)
+
+
+def first_datagram(
+    make_launch: Callable[..., Launch], kind: type[Node], worlds: Iterator[PoseWorld], **settings: str
+) -> bytes:
+    """What a node that sends datagrams of the trajectory's poses sends first."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(30)
+        settings[f"{kind.name}__port"] = str(listener.getsockname()[1])
+        launch = make_launch(nodes=f'["trajectory", "{kind.name}"]', transport__lossless="false", **settings)
+        with (
+            Publisher(launch.transport.endpoint("trajectory")) as publisher,
+            running(kind(launch)),
+            repeated(lambda: publisher.publish(POSE_WORLD, next(worlds))),
+        ):
+            return listener.recv(65536)
 
 
 def until(condition: Callable[[], bool], *, timeout_s: float = 30.0) -> None:

@@ -15,7 +15,6 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes import extras
 from steadypose.nodes.commands import doctor as command
-from steadypose.nodes.commands import doctor as live
 from steadypose.nodes.commands import doctor_checks as checks
 from steadypose.nodes.commands.doctor import doctor
 from steadypose.nodes.commands.doctor_checks import INSTALL, Finding, Verdict
@@ -228,7 +227,7 @@ class Tracker(Node):
 def file(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     path = tmp_path / "launch.toml"
     path.write_text(f'[transport]\ndirectory = "{folder}"\nlossless = false\n')
-    monkeypatch.setattr(live, "LISTEN_NS", 800_000_000)
+    monkeypatch.setattr(command, "LISTEN_NS", 800_000_000)
     return str(path)
 
 
@@ -238,7 +237,7 @@ def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
     node = Tracker(Launch.read(file), Clock())
     node.frames = tuple(frames)
     with running(*[node] if frames else []):
-        return live.listen(file, console), console.export_text()
+        return command.listen(file, console), console.export_text()
 
 
 @pytest.mark.parametrize(

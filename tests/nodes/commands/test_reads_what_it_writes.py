@@ -10,7 +10,7 @@ from steadypose.nodes.cli import main
 from steadypose.nodes.commands.complete import complete
 from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import history_of_path
-from steadypose.nodes.sinks.plot.video import View, write_video
+from steadypose.nodes.sinks.plot.video import View
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import J
 
@@ -107,16 +107,6 @@ def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
     raws = [message for _, message in open_recording(tmp_path / "two.csv") if isinstance(message, PoseRaw)]
     assert [body.id for body in raws[-1].bodies] == [0, 1]
     assert [body.id for body in raws[0].bodies] == [0]
-
-
-@pytest.mark.parametrize(
-    ("name", "start"), [("walk.gif", b"GIF89a"), pytest.param("walk.mp4", b"", marks=pytest.mark.slow)]
-)
-def test_a_video_has_every_second_pose(cleaned: Path, name: str, start: bytes, tmp_path: Path) -> None:
-    frames = write_video(history_of_path(cleaned / "walk"), tmp_path / name)
-    assert frames == pytest.approx(FRAMES / 2, abs=1)
-    assert (tmp_path / name).read_bytes().startswith(start)
-    assert (tmp_path / name).stat().st_size > 3_000
 
 
 def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:

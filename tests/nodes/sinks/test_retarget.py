@@ -1,20 +1,19 @@
 import json
-import socket
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import repeated, running
+from conftest import first_datagram
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose import PACKAGE
 from steadypose.msgs.recording import RecordingWriter
-from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.transport import Publisher
+from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import CONTACTS, Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.graph.launch import Launch, bundled
@@ -251,21 +250,7 @@ def test_links_are_named_where_their_names_do_not_tell(tmp_path: Path) -> None:
 
 
 def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
-    stream = worlds("idle")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(30)
-        launch = make_launch(
-            nodes='["trajectory", "retarget"]', transport__lossless="false", retarget__urdf=str(URDF),
-            retarget__port=str(listener.getsockname()[1]),
-        )  # fmt: skip
-        frames = iter(stream)
-        with (
-            Publisher(launch.transport.endpoint("trajectory")) as publisher,
-            running(RetargetNode(launch)),
-            repeated(lambda: publisher.publish(POSE_WORLD, next(frames, stream[-1]))),
-        ):
-            said = json.loads(listener.recv(65536))
+    said = json.loads(first_datagram(make_launch, RetargetNode, cycle(worlds("idle")), retarget__urdf=str(URDF)))
     assert len(said["joints"]) == 29
     assert len(said["root"]) == 7
     assert set(said["stands"]) == {"left", "right"}

@@ -1,16 +1,14 @@
 import dataclasses
-import socket
 from collections.abc import Callable
 from itertools import count
 
 import numpy as np
 import pytest
-from conftest import repeated, running
+from conftest import first_datagram
 from scipy.spatial.transform import Rotation
 from tests.helpers import synthetic_poses
 
-from steadypose.msgs.topics import POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.transport import Publisher
+from steadypose.msgs.topics import POSE_TRUTH
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.graph.launch import Launch
 from steadypose.prior.body.skeleton import PARENTS, J
@@ -61,17 +59,7 @@ def test_nobody_is_said_too() -> None:
 
 
 def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:
-    one, stamps = world(), count(0, 33_333_333)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
-        listener.bind(("127.0.0.1", 0))
-        listener.settimeout(30)
-        launch = make_launch(
-            nodes='["trajectory", "vmc"]', transport__lossless="false", vmc__port=str(listener.getsockname()[1])
-        )
-        with (
-            Publisher(launch.transport.endpoint("trajectory")) as publisher,
-            running(VmcNode(launch)),
-            repeated(lambda: publisher.publish(POSE_WORLD, dataclasses.replace(one, stamp_ns=next(stamps)))),
-        ):
-            said = messages([listener.recv(65536)])
+    one = world()
+    worlds = (dataclasses.replace(one, stamp_ns=stamp_ns) for stamp_ns in count(0, 33_333_333))
+    said = messages([first_datagram(make_launch, VmcNode, worlds)])
     assert said[0] == ("/VMC/Ext/OK", [1]), "from the first moment on, though stamps count from 0"
