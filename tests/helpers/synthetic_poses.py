@@ -62,10 +62,6 @@ def to_camera(positions: NDArray[np.floating]) -> NDArray[np.float64]:
     return Rotation.from_quat(CAMERA.orientation).inv().apply(flat).reshape(positions.shape)
 
 
-def _f32(array: NDArray[np.floating]) -> NDArray[np.float32]:
-    return array.astype(np.float32)
-
-
 def sensor_joints(skeleton: Skeleton, positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """(J, 3) joints of a sensor at the canonical joints they are closest to in meaning; its others lie at the neck."""
     joints = np.repeat(positions[J["neck"]][None], len(skeleton.joints), axis=0)
@@ -98,7 +94,7 @@ def messages(
             if arm_hidden:
                 lost = table.to_canonical[hidden].any(axis=0)
                 joints[lost], confidence[lost] = np.nan, 0.0
-            raw_bodies.append(RawBody(body, _f32(to_camera(joints)), _f32(confidence)))
+            raw_bodies.append(RawBody(body, to_camera(joints), confidence))
             raw_of[frame, body] = joints, confidence
             true_bodies.append(_world(body, positions, rotations, velocity, np.full(22, JointState.SEEN), 0.0))
         yield POSE_RAW, PoseRaw(stamp, "camera", "made-up", skeleton, CAMERA, True, raw_bodies)
@@ -122,9 +118,9 @@ def messages(
             anomaly = float(noise.gamma(2.0, 0.15) + 3.0 * nonsense)
             clean_bodies.append(
                 CleanBody(
-                    body, _f32(to_camera(positions)), _f32(rotations), state.astype(np.uint8), _f32(sigma), anomaly,
-                    nonsense, np.full(22, anomaly, np.float32), _f32(np.linalg.norm(REST_OFFSETS, axis=1)),
-                    _f32(to_camera(canonical)), _f32(trust),
+                    body, to_camera(positions), rotations, state, sigma, anomaly,
+                    nonsense, np.full(22, anomaly), np.linalg.norm(REST_OFFSETS, axis=1),
+                    to_camera(canonical), trust,
                 )
             )  # fmt: skip
             world_bodies.append(_world(body, positions, rotations, velocity, state, 0.06 if arm_hidden else 0.012))
@@ -136,6 +132,6 @@ def _world(body: int, positions, rotations, velocity, state, sigma: float) -> Wo
     heights = positions[[J[name] for name in CONTACTS], 2]
     contacts = np.clip((0.11 - heights) / 0.05, 0, 1)
     return WorldBody(
-        body, positions[0], rotations[0], velocity, np.eye(6) * 1e-4, _f32(positions), _f32(rotations),
-        state.astype(np.uint8), np.full(22, sigma, np.float32), _f32(contacts), Tracking.OK,
+        body, positions[0], rotations[0], velocity, np.eye(6) * 1e-4, positions, rotations,
+        state, np.full(22, sigma), contacts, Tracking.OK,
     )  # fmt: skip

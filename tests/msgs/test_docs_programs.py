@@ -6,14 +6,13 @@ import re
 import select
 import shutil
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 from tests.helpers.msg_strategies import raw, world
+from tests.helpers.processes import another_python
 
 from steadypose.msgs.codec import encode
 from steadypose.msgs.delivery import PREFIX, VERSION
@@ -39,17 +38,9 @@ FOREIGN_SUBSCRIBER, FOREIGN_PUBLISHER = (
 )
 
 
-@contextmanager
-def running(code: str, tmp_path: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    program = tmp_path / "program.py"
-    program.write_text(code)
+def running(code: str, tmp_path: Path, *arguments: str) -> AbstractContextManager[subprocess.Popen[str]]:
     environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, program, *arguments]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+    return another_python(code, tmp_path, *arguments, environment=environment)
 
 
 @pytest.mark.parametrize("code", [SUBSCRIBER, PUBLISHER, READER])

@@ -3,8 +3,6 @@
 import os
 import shutil
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -123,19 +121,6 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.importorskip(package, reason="there are no wheels for this machine: only x86-64 has them")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))  # above 101 a domain's ports may be taken by others
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
-@contextmanager
-def another_python(script: str, folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python process with this script, ended with the block at the latest."""
-    file = folder / "script.py"
-    file.write_text(script)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src")}
-    with subprocess.Popen([sys.executable, file, *arguments], env=environment, stdout=subprocess.PIPE, text=True) as it:
-        try:
-            yield it
-        finally:
-            it.kill()
 
 
 @contextmanager

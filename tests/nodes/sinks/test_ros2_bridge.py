@@ -12,8 +12,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, another_python, running, until
+from conftest import VirtualClock, running, until
 from scipy.spatial.transform import Rotation
+from tests.helpers.processes import another_python
 from tests.helpers.ros_output import Kept
 from tests.helpers.synthetic_poses import messages
 

@@ -10,13 +10,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import running, until
+from tests.helpers.processes import another_python
 from tests.helpers.synthetic_poses import messages
 
 from steadypose.msgs.codec import DEFINITIONS, encode
@@ -79,19 +80,11 @@ while True:
 """
 
 
-@contextmanager
-def sourced(script: str, folder: Path, python: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python process with this script after ``. install/setup.sh``, ended with the block at the latest."""
-    file = folder / f"{len(script)}.py"
-    file.write_text(script)
+def sourced(script: str, folder: Path, python: Path, *arguments: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """A Python process with this script after ``. install/setup.sh``."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("LD_LIBRARY", "_ROS"))}
-    environment["PYTHONPATH"] = str(ROOT / "src")
-    command = ["sh", "-c", '. "$0" && exec "$@"', str(BUILT / "setup.sh"), str(python), str(file), *arguments]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as it:
-        try:
-            yield it
-        finally:
-            it.kill()
+    command = ("sh", "-c", '. "$0" && exec "$@"', str(BUILT / "setup.sh"), str(python))
+    return another_python(script, folder, *arguments, python=command, environment=environment)
 
 
 @contextmanager

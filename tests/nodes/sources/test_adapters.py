@@ -1,7 +1,4 @@
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace as Made
 
@@ -9,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.helpers.fake_oak import CAMERA, moment
+from tests.helpers.processes import another_python
 from tests.helpers.synthetic_poses import sensor_joints, walker
 
 from steadypose.msgs.codec import decode, encode
@@ -191,24 +189,16 @@ def detect():
 """
 
 
-def test_the_publisher_publishes(tmp_path: Path) -> None:
+def test_the_publisher_publishes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = moment(3)
     pixels = CAMERA.project(scene.joints[0])
     np.savez(tmp_path / "scene.npz", pixels=pixels, depth=scene.depth, intrinsics=CAMERA.intrinsics)
     (tmp_path / "detector.py").write_text(DETECTOR)
-    (tmp_path / "publisher.py").write_text(BLOCKS["publisher.py"])
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     address = f"ipc://{tmp_path}/steadypose/pose_input"
-    root = str(DOCS.parent / "src")
-    with (
-        Subscriber(address, POSE_RAW) as subscriber,
-        subprocess.Popen(
-            [sys.executable, "publisher.py"],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": root, "XDG_RUNTIME_DIR": str(tmp_path)},
-        ) as process,
-    ):
+    with Subscriber(address, POSE_RAW) as subscriber, another_python(BLOCKS["publisher.py"], tmp_path):
         received = subscriber.receive(SOON_S)
-        process.kill()
     assert received
     frame = received[1]
     assert isinstance(frame, PoseRaw)

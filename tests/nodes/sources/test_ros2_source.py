@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, another_python, raw, running, until, walking
+from conftest import VirtualClock, raw, running, until, walking
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.helpers.processes import another_python
 from tests.helpers.synthetic_poses import walker
 
 from steadypose.msgs.codec import MAX_BODIES

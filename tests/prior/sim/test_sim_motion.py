@@ -123,10 +123,5 @@ def test_two_bones_reach_their_goal(direction: tuple[float, ...], share: float, 
     np.testing.assert_allclose(lengths[0] * first + lengths[1] * second, goal, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(first), 1.0)
     assert float((hinge * goal).sum()) == pytest.approx(0.0, abs=1e-9)
-    assert (
-        float(
-            (first * np.array([pole])).sum()
-            - (goal / np.linalg.norm(goal) * first).sum() * (goal / np.linalg.norm(goal) * np.array([pole])).sum()
-        )
-        >= -1e-9
-    ), "the middle joint lies on the pole's side"
+    across = np.array(pole) - goal[0] * (goal[0] @ pole) / (goal[0] @ goal[0])
+    assert first[0] @ across >= -1e-9, "the middle joint lies on the pole's side"
