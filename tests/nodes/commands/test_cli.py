@@ -120,14 +120,6 @@ def test_a_reader_that_has_seen_enough_is_no_error() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_keys_are_made_once(capsys, tmp_path: Path) -> None:
-    assert main(["keys", str(tmp_path / "keys")]) == 0
-    secret = tmp_path / "keys" / "own.key_secret"
-    assert secret.stat().st_mode & 0o077 == 0
-    assert main(["keys", str(tmp_path / "keys")]) == USAGE_ERROR
-    assert "exists already" in capsys.readouterr().err
-
-
 def test_what_needs_no_torch_does_not_import_it_and_what_an_extra_brings_is_named() -> None:
     lacking = {
         "torch": ("train", ["train", "hmvae"]),

@@ -125,7 +125,6 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
         ("in.npz", {}, "nothing is written in place"),
         ("no/out.npz", {}, "make it first"),
         ("out.npz", {"picture": Path("a.txt")}, r"ending in \.png"),
-        ("out.npz", {"weights": "nobody"}, "no weights 'nobody'"),
         ("out.npz", {"source": Path("mm.npz")}, "expected metres"),
         ("out.npz", {"source": Path("none.npz")}, "expected a body with joints"),
         ("mine.npz", {}, "--force"),

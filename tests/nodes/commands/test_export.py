@@ -44,12 +44,16 @@ def motion() -> BodyMotion:
     return BodyMotion(30.0, root, rotations.reshape(FRAMES, 22, 4), 1.1 * REST_OFFSETS)
 
 
-def npz(path: Path, motion: BodyMotion, turn: Rotation) -> Path:
-    """What ``clean`` writes of it, from a sensor whose axes are turned."""
+def npz(
+    path: Path, motion: BodyMotion, turn: Rotation | None = None, gap: slice = slice(0), backwards: bool = False
+) -> Path:
+    """What ``clean`` writes of it, from a sensor whose axes are turned, without anybody in a gap."""
+    turn = turn or Rotation.identity()
     rotations = motion.rotations.copy()
     rotations[:, 0] = (turn * Rotation.from_quat(rotations[:, 0])).as_quat()
     world = motion.positions
-    stamps = np.round(np.arange(FRAMES) * 1e9 / 30).astype(np.int64)
+    rotations[gap] = world[gap] = np.nan
+    stamps = np.round(np.arange(FRAMES) * 1e9 / 30).astype(np.int64)[:: -1 if backwards else 1]
     np.savez(path, positions=world @ turn.as_matrix().T, world_positions=world, rotations=rotations, stamp_ns=stamps)
     return path
 
@@ -166,20 +170,14 @@ def test_of_a_recording_the_body_that_is_there_longest_or_was_asked_for(tmp_path
 
 
 def test_of_an_npz_of_one_body_another_id_is_refused(tmp_path: Path, motion: BodyMotion) -> None:
-    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    path = npz(tmp_path / "clean.npz", motion)
     assert len(read_motion(path, 0).root) == FRAMES, "`info` calls it 0"
     with pytest.raises(ExportError, match="no body 7 to export; bodies in it: 0"):
         read_motion(path, 7)
 
 
 def test_a_gap_is_filled_and_the_rate_kept(tmp_path: Path, motion: BodyMotion) -> None:
-    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
-    with np.load(path) as file:
-        arrays = dict(file)
-    for name in ("positions", "world_positions", "rotations"):
-        arrays[name][11:14] = np.nan
-    np.savez(path, **arrays)
-    found = read_motion(path)
+    found = read_motion(npz(tmp_path / "clean.npz", motion, gap=slice(11, 14)))
     assert len(found.root) == FRAMES
     np.testing.assert_allclose(found.positions, motion.positions, atol=0.05)
     np.testing.assert_allclose(found.positions[14:], motion.positions[14:], atol=1e-6)
@@ -210,10 +208,7 @@ def test_a_body_is_placed_by_all_its_joints(motion: BodyMotion) -> None:
 
 
 def test_stamps_that_decrease_are_refused_with_what_to_do(tmp_path: Path, motion: BodyMotion, capsys) -> None:
-    path = npz(tmp_path / "clean.npz", motion, Rotation.identity())
-    with np.load(path) as file:
-        arrays = dict(file)
-    np.savez(path, **arrays | {"stamp_ns": arrays["stamp_ns"][::-1]})
+    path = npz(tmp_path / "clean.npz", motion, backwards=True)
     assert main(["export", str(path), str(tmp_path / "x.bvh")]) == 2
     assert (
         "expected increasing stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"
@@ -223,7 +218,7 @@ def test_stamps_that_decrease_are_refused_with_what_to_do(tmp_path: Path, motion
 
 @pytest.mark.parametrize("suffix", [".csv", ".trc"])
 def test_tables_come_back_as_they_went(tmp_path: Path, motion: BodyMotion, suffix: str) -> None:
-    source, out = npz(tmp_path / "clean.npz", motion, Rotation.identity()), tmp_path / f"take{suffix}"
+    source, out = npz(tmp_path / "clean.npz", motion), tmp_path / f"take{suffix}"
     assert main(["export", str(source), str(out)]) == 0
     frames = [message for _, message in open_recording(out) if isinstance(message, PoseRaw)]
     found = np.stack([frame.bodies[0].positions for frame in frames])
@@ -245,7 +240,7 @@ def test_tables_come_back_as_they_went(tmp_path: Path, motion: BodyMotion, suffi
 def test_what_cannot_be_written_is_said(
     source: str, out: str, more: list[str], said: str, tmp_path: Path, motion: BodyMotion, capsys
 ) -> None:
-    npz(tmp_path / "clean.npz", motion, Rotation.identity())
+    npz(tmp_path / "clean.npz", motion)
     np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
     (tmp_path / "there.glb").touch()
     assert main(["export", str(tmp_path / source), str(tmp_path / out), *more]) == 2
@@ -254,7 +249,7 @@ def test_what_cannot_be_written_is_said(
 
 
 def test_a_vrm_animation_rests_in_a_t_and_names_its_humanoid(tmp_path: Path, motion: BodyMotion) -> None:
-    source = npz(tmp_path / "in.npz", motion, Rotation.identity())
+    source = npz(tmp_path / "in.npz", motion)
     assert main(["export", str(source), str(tmp_path / "take.vrma")]) == 0
     file: Any = GLTF2().load_binary(str(tmp_path / "take.vrma"))
     bones = file.extensions["VRMC_vrm_animation"]["humanoid"]["humanBones"]
@@ -273,7 +268,7 @@ def test_a_vrm_animation_rests_in_a_t_and_names_its_humanoid(tmp_path: Path, mot
 def test_joints_have_the_names_of_the_rig_that_is_asked_for(
     tmp_path: Path, motion: BodyMotion, names: str, elbow: str
 ) -> None:
-    source = npz(tmp_path / "in.npz", motion, Rotation.identity())
+    source = npz(tmp_path / "in.npz", motion)
     for out in ("take.bvh", "take.glb"):
         assert main(["export", str(source), str(tmp_path / out), "--names", names]) == 0
     found = bvhio.readAsHierarchy(str(tmp_path / "take.bvh"))

@@ -1,5 +1,4 @@
 import contextlib
-import importlib.util
 import itertools
 import os
 import select
@@ -21,10 +20,8 @@ from tests.helpers.synthetic_poses import CAMERA, messages, walker
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseRaw, RawBody, Tracking
-from steadypose.nodes import extras
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings
-from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer import scene
 from steadypose.nodes.sinks.viewer import server as viewer_server
@@ -293,13 +290,6 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(tmp_path: Pat
     assert log.last("clean/made-up/0/bones") is not None
     assert raised, "with its server gone the node ends, to be started again"
     assert log.disconnected
-
-
-def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "rerun" else found(name))
-    with pytest.raises(LaunchError, match="add view"):
-        ViewerNode(Launch())
 
 
 def test_the_page_may_call_nobody_but_this_server(server: ViewerServer) -> None:

@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.nodes import extras
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import LaunchError
@@ -28,7 +27,7 @@ from steadypose.nodes.sources.camera import PAUSES_S, CameraSource, MergeSetting
 from steadypose.nodes.sources.image import ImageReader
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.registry import InputSettings
 from steadypose.nodes.sources.source import CalibrationSettings, SourceContext, WebcamSettings
 from steadypose.nodes.sources.webcam_device import Lens, VideoSource
 from steadypose.prior.clean.settings import PriorSettings
@@ -226,12 +225,6 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         camera.open_webcam(settings, SourceContext(Clock(), NOT_CALIBRATED))
-
-
-def test_without_mediapipe_it_says_what_to_install(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match="add webcam"):
-        open_input(InputSettings(source="webcam", webcam=WebcamSettings(model=model)), Clock())
 
 
 def test_the_launch_file_needs_no_download() -> None:

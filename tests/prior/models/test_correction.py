@@ -89,8 +89,3 @@ def test_a_hidden_joint_stays_hidden_and_a_hidden_trunk_fades_the_correction() -
     assert np.isfinite(out[:, J["head"]]).all()
     moved = np.linalg.norm(out - holed, axis=-1)[:, J["head"]]
     assert moved[59] == pytest.approx(moved[39] * 0.9**20, rel=0.01)
-
-
-def test_an_unknown_sensor_is_said() -> None:
-    with pytest.raises(FileNotFoundError, match="kinect_v2"):
-        Correct(CorrectSettings("kinect_v9"), 1)

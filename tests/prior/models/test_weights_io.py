@@ -23,7 +23,9 @@ def test_weights_that_ship_are_those_of_one_model_alone(path: Path, tmp_path: Pa
             load_weights(str(copy), other)
 
 
-def test_a_damaged_file_and_one_without_configuration_are_refused(tmp_path: Path) -> None:
+def test_a_missing_file_a_damaged_one_and_one_without_configuration_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no weights 'own' for correction: .*; there are kinect_v2"):
+        load_weights("own", "correction")
     path = tmp_path / "contacts-own.safetensors"
     path.write_bytes(b"\xff" * 100)
     with pytest.raises(WeightsError, match="expected weights as"):

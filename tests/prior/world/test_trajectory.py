@@ -245,11 +245,6 @@ def test_settings_are_checked():
         TrajectorySettings.from_dict({"timeout_s": 0})
 
 
-def test_unknown_weights_say_which_there_are():
-    with pytest.raises(FileNotFoundError, match="default"):
-        TrajectoryPipeline(TrajectorySettings(weights="nobody"))
-
-
 STEP_M, TREAD_M = 0.17, 0.55
 
 
