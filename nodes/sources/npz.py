@@ -21,22 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
-from steadypose.msgs.types import (
-    OBSERVED,
-    CleanBody,
-    Message,
-    Pose,
-    PoseClean,
-    PoseRaw,
-    PoseWorld,
-    RawBody,
-    Tracking,
-    WorldBody,
-)
+from steadypose.msgs.topics import POSE_RAW
+from steadypose.msgs.types import OBSERVED, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.layout import axes_hint, count_hint, skeleton_hint, stamps_hint
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
-from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.clean.admission import MAX_DISTANCE
 from steadypose.prior.npz import check_arrays
 
@@ -64,50 +52,6 @@ def as_input(arrays: Arrays) -> Arrays:
     positions = np.where(observed[..., None], arrays["world_positions"], np.nan)
     kept = {name: arrays[name] for name in ("stamp_ns", "body_id") if name in arrays}
     return kept | {"positions": positions, "skeleton": np.array(CANONICAL.name), "up": np.array("z")}
-
-
-def as_messages(arrays: Arrays) -> Iterator[tuple[str, Message]]:
-    """Convert the arrays of an output to ``pose/clean`` and ``pose/world``, both in the world, without input joints."""
-    several = "body_id" in arrays
-    ids = arrays["body_id"].tolist() if several else [0]
-    names = [name for name in arrays if name not in ("stamp_ns", "joint_names", "body_id", "bone_lengths")]
-    rows = {name: arrays[name] if several else arrays[name][:, None] for name in names if arrays[name].ndim}
-    parents = np.maximum(PARENTS, 0)
-    for frame, stamp_ns in enumerate(arrays["stamp_ns"].tolist()):
-        clean, world = [], []
-        for number, body in enumerate(ids):
-            row = {name: rows[name][frame, number] for name in rows if len(rows[name]) > frame}
-            joints = row["world_positions"]
-            if np.isnan(joints).all():
-                continue
-            shared = {"id": body, "positions": joints, "state": row["state"], "sigma": row["sigma"]}
-            clean.append(
-                CleanBody(
-                    **shared,
-                    rotations=row["rotations"],
-                    anomaly=float(row["anomaly"]),
-                    anomaly_flag=bool(row["anomaly_flag"]),
-                    joint_anomaly=row["joint_anomaly"],
-                    bone_lengths=np.linalg.norm(joints - joints[parents], axis=-1),
-                    raw_positions=np.full_like(joints, np.nan),
-                    raw_confidence=np.zeros(len(joints)),
-                )
-            )
-            world.append(
-                WorldBody(
-                    **shared,
-                    root_position=joints[0],
-                    root_orientation=row["rotations"][0],
-                    root_velocity=row["root_velocity"],
-                    covariance=np.zeros((6, 6)),
-                    rotations=row["rotations"],
-                    contacts=row["contacts"],
-                    tracking=Tracking.OK,
-                )
-            )
-        pose = Pose.identity()
-        yield POSE_CLEAN, PoseClean(stamp_ns, "world", "arrays", pose, True, 0, clean)
-        yield POSE_WORLD, PoseWorld(stamp_ns, "world", "arrays", np.array([0.0, 0.0, 1.0, 0.0]), world)
 
 
 STAMPS_END_NS = 2**31 * 10**9

@@ -16,7 +16,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import JOINTS, Diagnostics, Message, PoseClean, PoseEvents, PoseRaw, PoseWorld, Tracking
 from steadypose.nodes.sinks.drawing import to_world
-from steadypose.nodes.sources.npz import Arrays, ArraySource, as_messages, is_output, read_arrays
+from steadypose.nodes.sources.npz import Arrays, ArraySource, is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 
@@ -84,8 +84,7 @@ def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
     Raises:
         NpzError: the arrays are neither an output nor an input.
     """
-    messages = as_messages(arrays) if is_output(arrays) else ArraySource(Path(name), arrays)
-    return _of_source(name, messages)
+    return _of_output(name, arrays) if is_output(arrays) else _of_source(name, ArraySource(Path(name), arrays))
 
 
 def history_of_path(path: Path) -> History:
@@ -103,6 +102,28 @@ def history_of_path(path: Path) -> History:
         history.dropped_or_refused.update({f"unreadable {topic}": count for topic, count in reader.refused.items()})
         if not reader.complete:
             history.dropped_or_refused["bytes cut off"] = reader.lost_bytes
+    return history
+
+
+def _of_output(name: str, arrays: Arrays) -> History:
+    """The history of an output, without input joints. Both topics are in the world."""
+    several, time = "body_id" in arrays, (arrays["stamp_ns"] - arrays["stamp_ns"].min()) / 1e9
+    history = History(name, {POSE_CLEAN: time, POSE_WORLD: time}, origin="source arrays")
+    for number, body in enumerate(arrays["body_id"].tolist() if several else [0]):
+
+        def of_body(name: str, number: int = number) -> NDArray[Any]:
+            return arrays[name][:, number] if several else arrays[name]
+
+        there = ~np.isnan(of_body("world_positions")).all(axis=(1, 2))
+        if there.any():
+            joints, state, sigma, anomaly, flag, contacts = (
+                of_body(key)[there]
+                for key in ("world_positions", "state", "sigma", "anomaly", "anomaly_flag", "contacts")
+            )
+            raw, tracking = np.full_like(joints, np.nan), np.zeros(len(joints), np.uint8)
+            track = Track(time[there], joints, raw, state, sigma, anomaly, flag, contacts, tracking)
+            for topic in history.stamps:
+                history.tracks.setdefault(topic, {})[body] = track
     return history
 
 
