@@ -86,7 +86,7 @@ _NODES: dict[str, NodeDeclaration] = {
         publishes=(POSE_RAW, POSE_TRUTH),
         section="input",
         settings="steadypose.nodes.sources.registry:InputSettings",
-        preflight="steadypose.nodes.sources.registry:check_input",
+        preflight="steadypose.nodes.sources.registry:open_input",
     ),
     "prior": NodeDeclaration(
         node="steadypose.nodes.graph.prior_node:PriorNode",

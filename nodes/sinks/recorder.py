@@ -22,7 +22,7 @@ from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError, path_setting
-from steadypose.nodes.sources.registry import InputSettings, open_input
+from steadypose.nodes.sources.registry import open_input
 from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.settings import nearest
 
@@ -111,7 +111,7 @@ def free_directory(launch: Launch) -> Path | None:
 
 def _replays(launch: Launch) -> bool:
     own = "pose_input" in launch.nodes
-    return own and not isinstance(open_input(launch.settings(InputSettings), Clock()), LiveSource)
+    return own and not isinstance(open_input(launch), LiveSource)
 
 
 def _is_recording(directory: Path) -> bool:

@@ -14,7 +14,6 @@ from steadypose.nodes.graph.clock import POLL_S, Clock, Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.relay import CONTEXT
-from steadypose.nodes.sources.image import NAME as IMAGE
 from steadypose.nodes.sources.recording import end_of
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
@@ -56,15 +55,8 @@ class PoseInputNode(Node):
     ) -> None:
         super().__init__(launch, clock)
         settings = launch.settings(InputSettings)
-        transport = launch.transport
-        self._source = source or open_input(
-            settings,
-            self.clock,
-            transport.curve_keys(),
-            clear_text=transport.clear_text,
-            image_file=transport.ipc_directory / IMAGE if settings.image else None,
-        )
-        if transport.lossless and not isinstance(self._source, LiveSource):  # a camera cannot repeat its frames
+        self._source = source or open_input(launch, self.clock)
+        if launch.transport.lossless and not isinstance(self._source, LiveSource):  # a camera cannot repeat its frames
             self._lag = CONTEXT
         self._rate = settings.rate
         self._loop = settings.loop

@@ -6,15 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from steadypose.msgs.security import Keys
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.settings import STREAMS, LaunchError, load_plugin, path_setting
 from steadypose.nodes.sources.camera import MergeSettings, MergeSource, open_oak, open_webcam
+from steadypose.nodes.sources.image import NAME as IMAGE
 from steadypose.nodes.sources.ros2 import Ros2Settings, Ros2Source, TfSettings, TfSource
 from steadypose.nodes.sources.source import (
     CalibrationSettings,
@@ -81,37 +80,24 @@ SOURCES: Mapping[str, tuple[Callable[[Any, SourceContext], RecordedSource | Live
 camera is opened only when its frames are requested."""
 
 
-def open_input(
-    settings: InputSettings,
-    clock: Clock,
-    keys: Keys | None = None,
-    *,
-    clear_text: bool = False,
-    image_file: Path | None = None,
-) -> RecordedSource | LiveSource:
-    """Open the source that ``[input]`` names, with the rest as in `SourceContext`.
+def open_input(launch: Launch, clock: Clock | None = None) -> RecordedSource | LiveSource:
+    """Open the source that ``[input]`` of a launch file names, for a node with this ``clock``.
 
     Raises:
         LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
     """
+    settings, transport, clock = launch.settings(InputSettings), launch.transport, clock or Clock()
     if ":" in settings.source:
         opens, extra, own = load_plugin("[input] source", settings.source), "", settings.options
     else:
         (opens, extra), own = SOURCES[settings.source], getattr(settings, settings.source)
     if extra:
         require_extra(extra)
-    source = opens(own, SourceContext(clock, settings.calibration, keys, clear_text, image_file))
+    image_file = transport.ipc_directory / IMAGE if settings.image else None
+    context = SourceContext(clock, settings.calibration, transport.curve_keys(), transport.clear_text, image_file)
+    source = opens(own, context)
     if not settings.tf.fixed_frame:
         return source
     if not isinstance(source, LiveSource):
         raise LaunchError(f"[input.tf] is for live sources: expected a camera or ros2, got {settings.source}")
     return TfSource(source, settings.tf, clock)
-
-
-def check_input(launch: Launch) -> None:
-    """Check that the input node can open its source.
-
-    Raises:
-        LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
-    """
-    open_input(launch.settings(InputSettings), Clock())

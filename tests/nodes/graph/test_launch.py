@@ -13,7 +13,7 @@ from steadypose.nodes.graph.launch import (
 )
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
-from steadypose.nodes.sources.registry import InputSettings, check_input
+from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.prior.clean.settings import PersonSettings, PriorSettings
 from steadypose.prior.settings import _warn_of_former_name
 
@@ -146,7 +146,7 @@ def test_the_users_own_file_comes_before_a_bundled_stream(write, tmp_path: Path)
     (tmp_path / "walk_turn").mkdir()
     assert Launch.read(launch).settings(InputSettings).recording == str(tmp_path / "walk_turn")
     with pytest.raises(LaunchError, match=r"the bundled stream is 'walk_turn', without a folder"):
-        check_input(Launch.read(write("[input]\nrecording = 'sim_data/walk_turn'")))
+        open_input(Launch.read(write("[input]\nrecording = 'sim_data/walk_turn'")))
 
 
 def test_weights_are_looked_for_before_anything_starts(write, tmp_path: Path) -> None:

@@ -11,12 +11,11 @@ import pytest
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD, TOPICS
 from steadypose.nodes.extras import EXTRAS
 from steadypose.nodes.graph import topology
-from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, NodeDeclaration, load, publishers
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sources.registry import SOURCES, InputSettings, check_input, open_input
+from steadypose.nodes.sources.registry import SOURCES, InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 
 
@@ -109,7 +108,7 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
     package.opens = opens
     launch = read(tmp_path / "a.toml", '[input]\nsource = "acme:opens"\noptions = {port = 7}')
     settings = launch.settings(InputSettings)
-    assert open_input(settings, Clock()) is source
+    assert open_input(launch) is source
     assert given == [({"port": 7}, settings.calibration)]
 
 
@@ -127,4 +126,4 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
 def test_what_is_no_plugin_is_said(package: Any, tmp_path: Path, text: str, said: str) -> None:
     package.TEXT, package.OTHER = "text", NodeDeclaration("acme:Node")
     with pytest.raises(LaunchError, match=said):
-        check_input(read(tmp_path / "a.toml", text))
+        open_input(read(tmp_path / "a.toml", text))

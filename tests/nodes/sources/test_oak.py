@@ -267,7 +267,7 @@ def test_an_archive_that_is_not_there_says_so(tmp_path: Path) -> None:
 def test_the_launch_file_can_be_run_without_a_camera_being_there() -> None:
     launch = Launch.read("oak")
     assert not launch.transport.lossless
-    assert isinstance(open_input(launch.settings(InputSettings), Clock()), CameraSource)
+    assert isinstance(open_input(launch), CameraSource)
     _check(launch)
 
 

@@ -238,7 +238,7 @@ def test_a_recording_is_not_asked_of_tf(tmp_path: Any) -> None:
     np.savez(tmp_path / "x.npz", positions=np.zeros((3, 22, 3)), skeleton="smpl22", fps=30.0)
     settings = InputSettings(recording=str(tmp_path / "x.npz"), tf=TfSettings(fixed_frame="odom"))
     with pytest.raises(LaunchError, match="for live sources"):
-        open_input(settings, VirtualClock())
+        open_input(Launch(sections={"input": settings}))
 
 
 class Given(LiveSource):
