@@ -298,14 +298,6 @@ def test_quantities_do_not_depend_on_where_a_body_is_and_hardly_on_its_size() ->
         np.testing.assert_allclose(after.direction, about.apply(before.direction), atol=1e-6)
 
 
-def test_what_holds_is_told_with_every_message_and_since_when() -> None:
-    detector = EventDetector()
-    events = [detector.update(message(i, standing())) for i in range(30)]
-    stands = [e for told in events for e in told if e.kind == EventKind.STANDS]
-    assert [e.phase for e in stands[:2]] == [Phase.BEGINS, Phase.HOLDS]
-    assert {e.since_ns for e in stands} == {START_NS}
-
-
 def test_a_stream_that_begins_anew_begins_with_nobody() -> None:
     detector = EventDetector()
     for index in range(20):
@@ -332,25 +324,25 @@ def test_a_trigger_begins_above_its_threshold_only_and_ends_below_the_other_only
         assert trigger.confidence == pytest.approx(confidence, abs=1e-9)
 
 
+def waves(
+    angles: Iterable[float], heights: Iterable[float] | None = None, upright: Callable[[float], bool] = lambda _: True
+) -> list[bool]:
+    """Whether a forearm at these angles waves, frame by frame, whose hand is up, at heights of metres."""
+    wave, angles = Wave(EventSettings().wave_swing, EventSettings().wave_within), list(angles)
+    samples = zip(angles, heights or [0.4] * len(angles), strict=True)
+    return [wave.update(START_NS + k * FRAME_NS, *it, upright(it[0]), True) for k, it in enumerate(samples)]
+
+
 @pytest.mark.parametrize("course", [lambda t: 0.2 * t, lambda t: 0.1 * np.sin(9 * t), lambda t: 1.0 if t > 1 else 0.0])
 def test_a_forearm_that_does_not_swing_does_not_wave(course: Callable[[float], float]) -> None:
-    wave = Wave(0.28, 0.8)
-    assert not any(wave.update(k * FRAME_NS, course(k / 30), 0.4, True, True) for k in range(90))
+    assert not any(waves(course(k / 30) for k in range(90)))
 
 
 def test_an_arm_raised_aside_and_lowered_does_not_wave() -> None:
     """Its forearm comes up from one side and goes back to it: a swing, and back, but not about upright."""
-    wave = Wave(EventSettings().wave_swing, EventSettings().wave_within)
     angles = 0.6 + 0.42 * np.cos(np.linspace(0.0, 2.0 * np.pi, 40))
-    assert not any(wave.update(START_NS + k * FRAME_NS, angle, 0.4, True, True) for k, angle in enumerate(angles))
-    again = [*angles, *angles, *angles]
-    assert wave_begins(again), "but who does it again and again waves"
-
-
-def wave_begins(angles: Iterable[float], heights: Iterable[float] | None = None) -> bool:
-    wave, angles = Wave(EventSettings().wave_swing, EventSettings().wave_within), list(angles)
-    samples = zip(angles, heights or [0.4] * len(angles), strict=True)
-    return any(wave.update(START_NS + k * FRAME_NS, *sample, True, True) for k, sample in enumerate(samples))
+    assert not any(waves(angles))
+    assert any(waves([*angles, *angles, *angles])), "but who does it again and again waves"
 
 
 RAISED, OUT = [-0.3] * 10, np.linspace(-0.3, -0.05, 6).tolist()
@@ -359,31 +351,29 @@ BACK = np.linspace(-0.1, -0.7, 12).tolist()
 
 
 def test_a_wave_begins_when_the_forearm_is_back_from_its_first_swing_which_may_be_small() -> None:
-    assert wave_begins([*RAISED, *OUT, *BACK[:7]])
-    assert not wave_begins([*RAISED, *OUT, *BACK[:6]])
-    assert not wave_begins([*RAISED, *BACK[4:]])
-    assert not wave_begins([*RAISED, *[0.5 * (angle + 0.3) - 0.3 for angle in OUT], *BACK[2:]]), "that was no swing"
+    assert any(waves([*RAISED, *OUT, *BACK[:7]]))
+    assert not any(waves([*RAISED, *OUT, *BACK[:6]]))
+    assert not any(waves([*RAISED, *BACK[4:]]))
+    assert not any(waves([*RAISED, *[0.5 * (angle + 0.3) - 0.3 for angle in OUT], *BACK[2:]])), "that was no swing"
 
 
 def test_a_hand_that_comes_down_does_not_wave() -> None:
     heights = [*[0.4] * 16, *np.linspace(0.4, 0.2, 12)]
-    assert not wave_begins([*RAISED, *OUT, *BACK], heights)
-    assert wave_begins([*RAISED, *OUT, *BACK, *OUT], [*heights, *[0.2] * 6]), "but who swings it once more waves"
+    assert not any(waves([*RAISED, *OUT, *BACK], heights))
+    assert any(waves([*RAISED, *OUT, *BACK, *OUT], [*heights, *[0.2] * 6])), "but who swings it once more waves"
 
 
 def test_a_raised_hand_that_drifts_or_jumps_while_hidden_does_not_wave() -> None:
     slow = np.linspace(-0.1, -0.52, 22).tolist()
-    assert not wave_begins([*RAISED, *OUT, *slow])
-    assert not wave_begins([*RAISED, *OUT, *[np.nan] * 5, *[-0.7] * 10])
-    wave = Wave(EventSettings().wave_swing, EventSettings().wave_within)
-    angles = [*RAISED, *OUT, *BACK, *[np.nan] * 5, *[-0.2] * 5]
-    waves = [wave.update(START_NS + k * FRAME_NS, angle, 0.4, True, True) for k, angle in enumerate(angles)]
-    assert all(waves[waves.index(True) :]), "but a wave goes on"
+    assert not any(waves([*RAISED, *OUT, *slow]))
+    assert not any(waves([*RAISED, *OUT, *[np.nan] * 5, *[-0.7] * 10]))
+    told = waves([*RAISED, *OUT, *BACK, *[np.nan] * 5, *[-0.2] * 5])
+    assert all(told[told.index(True) :]), "but a wave goes on"
 
 
 def test_a_forearm_that_passes_straight_down_turns_on_in_the_same_direction() -> None:
     circle = np.arange(0.0, 4.0 * np.pi, 0.2)
-    assert not wave_begins(np.angle(np.exp(1j * circle)))
+    assert not any(waves(np.angle(np.exp(1j * circle))))
 
 
 def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_none() -> None:
@@ -402,13 +392,7 @@ def test_where_a_body_faces_is_told_through_noise_and_followed_where_there_is_no
 
 def test_a_swing_that_is_not_observed_is_none() -> None:
     """What a guess of a hidden forearm does waves at nobody; a wave that is hidden for a moment goes on."""
-    wave = Wave(0.36, 0.8)
-    angles = [0.5 * np.sin(9 * k / 30) for k in range(60)]
-    waves = [
-        wave.update(k * FRAME_NS, np.nan if 3 < k % 20 < 12 else angle, 0.4, True, True)
-        for k, angle in enumerate(angles)
-    ]
-    assert waves[-1]
+    assert waves(np.nan if 3 < k % 20 < 12 else 0.5 * np.sin(9 * k / 30) for k in range(60))[-1]
     body = message(0, raised(standing(), "left", swing=0.5)).bodies[0]
     assert features(body, np.zeros(3)).arms[0].swing == pytest.approx(-0.5, abs=0.01)
     body.state[J["left_elbow"]] = JointState.IMPUTED
@@ -435,14 +419,17 @@ def test_a_body_that_bends_down_neither_raises_a_hand_before_it_nor_sits() -> No
 
 
 def test_who_waves_with_the_whole_arm_begins_to_wave_once() -> None:
-    wave = Wave(0.36, 0.8)
-    angles = [1.3 * np.sin(9 * k / 30) for k in range(120)]
-    waves = [wave.update(k * FRAME_NS, angle, 0.4, abs(angle) < 1.0, True) for k, angle in enumerate(angles)]
-    begun = waves.index(True)
+    told = waves((1.3 * np.sin(9 * k / 30) for k in range(120)), upright=lambda angle: abs(angle) < 1.0)
+    begun = told.index(True)
     assert begun < 60
-    assert all(waves[begun:])
-    assert not wave.update(120 * FRAME_NS, 0.0, 0.4, False, False), "the hand is down"
-    assert not wave.update(121 * FRAME_NS, 0.0, 0.4, True, True), "and up again"
+    assert all(told[begun:])
+
+
+def test_a_wave_is_over_when_the_hand_is_down_though_it_comes_up_again() -> None:
+    wave = Wave(EventSettings().wave_swing, EventSettings().wave_within)
+    assert [wave.update(k * FRAME_NS, 0.5 * np.sin(9 * k / 30), 0.4, True, True) for k in range(60)][-1]
+    assert not wave.update(60 * FRAME_NS, 0.0, 0.4, False, False), "the hand is down"
+    assert not wave.update(61 * FRAME_NS, 0.0, 0.4, True, True), "and up again"
 
 
 @pytest.mark.parametrize(

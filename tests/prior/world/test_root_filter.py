@@ -3,12 +3,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS, limbs
 from steadypose.prior.world.filter import RootFilter
 from steadypose.prior.world.floor import Floor
@@ -168,9 +165,6 @@ def test_feet_that_are_not_known_have_no_place() -> None:
     assert np.isnan(ours.update(now, STILL, SWINGS, Floor(True)).feet[:, 0]).tolist() == [False, True, True, False]
 
 
-RESTS = np.ones(1)
-
-
 def spring(rate: float, dt: float) -> NDArray[np.float64]:
     """Of an error and its rate in units of ``rate``: x'' = -2 w x' - w² x."""
     return np.asarray(expm(rate * dt * np.array([[0.0, 1.0], [-1.0, -2.0]])), dtype=np.float64)
@@ -279,19 +273,3 @@ def test_feet_walk_and_the_root_accelerates_more_the_faster_the_root_moves(speed
         f.observe_foot(foot, np.zeros(3), 0.01, 0.0, from_root=False)
     f.predict(DT, load, rest)
     np.testing.assert_allclose(f.feet_sigma**2, np.tile((0.01**2 + expected * DT)[:, None], (1, 3)))
-
-
-@settings(max_examples=30)
-@given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 1000))
-def test_turns_with_the_world(yaw: float, seed: int):
-    turn = yaw_matrix(yaw)
-    ends = []
-    for r in (np.eye(3), turn):
-        rng = np.random.default_rng(seed)
-        f = BodyFilter(BodyNoise(), r @ rng.normal(size=3), 0.1, 0.05, r @ rng.normal(size=3), feet=1)
-        for _ in range(10):
-            f.predict(DT, RESTS, 0.5 * RESTS)
-            f.observe_velocity(r @ rng.normal(size=3), 0.1, bias=np.array([0.2, 0.2, 0.1]))
-            f.observe_foot(0, r @ rng.normal(size=3), 0.02, 0.02, from_root=True)
-        ends.append(np.stack([f.position, f.velocity]))
-    np.testing.assert_allclose(ends[1], ends[0] @ turn.T, atol=1e-9)
