@@ -179,12 +179,11 @@ class ViewerServer(Closing):
         Raises:
             ViewerError: the port is taken, or Rerun's server does not start.
         """
+        import rerun_cli
+
         self._page: PageServer | None = None
         self._drawings = Drawings()
         self._closed = threading.Event()
-        import rerun_cli
-
-        _refuse_used(host, port)
         inner, unused, token = _free_port(), _free_port(), secrets.token_urlsafe(24)
         at = f"http://{shown(host)}:{port}"
         self.data_url = f"{at}/{token}/{DRAWINGS}"
@@ -198,8 +197,11 @@ class ViewerServer(Closing):
             preexec_fn=_die_with_parent if sys.platform == "linux" else None,
         )
         try:
-            self._wait_for(inner)
             self._page = PageServer(host, port, f"http://{LOOPBACK}:{inner}", token, self._drawings)
+            self._wait_for(inner)
+        except OSError as error:
+            self.close()
+            raise ViewerError(port_taken("viewer", host, port, error)) from error
         except RuntimeError:
             self.close()
             raise
@@ -247,15 +249,6 @@ class ViewerServer(Closing):
                     return
             time.sleep(0.05)
         raise ViewerError(f"Rerun's server did not open port {port} within {timeout_s:.0f} s")
-
-
-def _refuse_used(host: str, port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise ViewerError(port_taken("viewer", host, port, error)) from error
 
 
 def _free_port() -> int:
