@@ -185,7 +185,7 @@ class _Run:
             except KeyboardInterrupt:
                 status, interrupted = 0, True
             notify(STOPPING)
-            supervisor.stop()
+            supervisor.close()
             if self._writes_health:
                 (transport.ipc_directory / HEALTH_FILE).unlink(missing_ok=True)
             while received := subscriber.receive(0):

@@ -8,6 +8,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Sequence
 
+from steadypose.msgs import Closing
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.node import RUN, SUPERVISOR
 from steadypose.nodes.graph.process import own_command, own_environment
@@ -165,7 +166,7 @@ def _environment(run: str) -> dict[str, str]:
     return kept | {SUPERVISOR: str(os.getpid()), RUN: run}
 
 
-class Supervisor:
+class Supervisor(Closing):
     """Runs the nodes of a launch, each in its own process. A context manager; leaving it stops all nodes."""
 
     def __init__(
@@ -197,13 +198,7 @@ class Supervisor:
         """Names of the nodes that have failed and are not restarted."""
         return [name for name, child in self.children.items() if child.state == "failed"]
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Stop all nodes in the order of the stream, the source first."""
         for name in sorted(self.children, key=list(NODES).index):
             self.children[name].stop()
-
-    def __enter__(self) -> Supervisor:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
+from steadypose.nodes.ros2.definitions import stamp_ns as stamp_of
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton
 from steadypose.prior.body.skeleton import finite_joints
@@ -80,7 +81,7 @@ def from_zed(message: Any, source: str = "zed") -> PoseRaw:
         # ZED gives one confidence per body, 1 to 99
         confidence = finite_joints(joints) * np.clip(person.confidence / 100, 0.0, 1.0)
         bodies.append(RawBody(person.label_id, joints, confidence))
-    return _message(_stamp_ns(message.header), message.header.frame_id, source, ZED38, "z", bodies)
+    return _message(stamp_of(message.header), message.header.frame_id, source, ZED38, "z", bodies)
 
 
 def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | None:
@@ -100,7 +101,7 @@ def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | N
         return None
     bodies = [RawBody(id, joints, finite_joints(joints)) for id, joints in found.items()]
     header = markers.markers[0].header
-    return _message(_stamp_ns(header), header.frame_id, source, AZURE_KINECT32, "-y", bodies)
+    return _message(stamp_of(header), header.frame_id, source, AZURE_KINECT32, "-y", bodies)
 
 
 def from_pose_array(poses: Any, skeleton: Skeleton, up: str, source: str = "pose_array") -> PoseRaw:
@@ -120,7 +121,7 @@ def from_pose_array(poses: Any, skeleton: Skeleton, up: str, source: str = "pose
     if len(points) % joints:
         raise ValueError(f"PoseArray: expected a multiple of the {joints} joints of {skeleton.name}, got {len(points)}")
     bodies = [RawBody(id, body, finite_joints(body)) for id, body in enumerate(points.reshape(-1, joints, 3))]
-    return _message(_stamp_ns(poses.header), poses.header.frame_id, source, skeleton, up, bodies)
+    return _message(stamp_of(poses.header), poses.header.frame_id, source, skeleton, up, bodies)
 
 
 def from_coco(
@@ -188,8 +189,3 @@ def _table(skeleton: Skeleton, points: Sequence[Any], name: str) -> Floats:
 
 def _message(stamp_ns: int, frame_id: str, source: str, skeleton: Skeleton, up: str, bodies: list[RawBody]) -> PoseRaw:
     return PoseRaw(stamp_ns, frame_id, source, skeleton.name, Pose.from_up(up), False, bodies)
-
-
-def _stamp_ns(header: Any) -> int:
-    """Stamp of a ROS 2 header, nanoseconds."""
-    return header.stamp.sec * 1_000_000_000 + header.stamp.nanosec

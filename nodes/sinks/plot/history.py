@@ -257,10 +257,7 @@ def _aligned(positions: NDArray[np.float64], expected: NDArray[np.float64]) -> N
 
 def nan_mean(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     """Mean over an axis without NaN; NaN where all values are NaN."""
-    counted = np.isfinite(values)
-    total = np.where(counted, values, 0.0).sum(axis=axis)
-    number = counted.sum(axis=axis)
-    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    return np.ma.masked_invalid(values).mean(axis=axis).filled(np.nan)
 
 
 class PlotError(ValueError):
