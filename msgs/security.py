@@ -154,12 +154,10 @@ class Keys:
     secret: bytes = field(repr=False)
     server: bytes
     """public key that a subscriber expects from its publishers"""
-    clients: frozenset[bytes]
-    """public keys that a publisher accepts; always includes `public`, for subscribers on the same machine"""
-    servers: Mapping[str, bytes] = field(default_factory=dict)
+    servers: Mapping[str, bytes]
     """public keys of publishers with individual keys, by host"""
-    directory: Path | None = None
-    """directory that the keys were read from"""
+    directory: Path
+    """directory that the keys were read from, and in which the clients' are"""
 
     def server_at(self, endpoint: str) -> bytes:
         """The public key of the publisher at an address. Raises ValueError if there is no key for its host."""
@@ -172,7 +170,8 @@ class Keys:
 
 
 class ClientList:
-    """The public keys that may subscribe, reread from the directory of keys at each call."""
+    """The public keys that may subscribe, reread from the directory of keys at each call. They include `Keys.public`,
+    for subscribers on the same machine."""
 
     def __init__(self, keys: Keys) -> None:
         self._keys = keys
@@ -188,8 +187,6 @@ class ClientList:
         return not before <= self._served
 
     def _read(self) -> frozenset[bytes]:
-        if self._keys.directory is None:
-            return self._keys.clients
         listed = {self._keys.public}
         for file in (self._keys.directory / "clients").glob("*.key"):
             with suppress(ValueError, OSError):  # a file that is still being written is ignored
@@ -263,8 +260,8 @@ def load_keys(directory: str | Path) -> Keys:
         raise ValueError(f"{secret_file}: expected a secret key, found none; make new keys")
     server_file = directory / "server.key"
     server = _public(server_file) if server_file.is_file() else public
-    clients = _listed(directory / "clients").values()
-    return Keys(public, secret, server, frozenset({public, *clients}), _listed(directory / "servers"), directory)
+    _listed(directory / "clients")  # a file that is no key is an error here, not a client that is refused later
+    return Keys(public, secret, server, _listed(directory / "servers"), directory)
 
 
 def _check_folder(folder: Path) -> None:

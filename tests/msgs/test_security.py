@@ -65,9 +65,7 @@ def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
     assert keys.secret.decode() in secret_file.read_text()
     assert keys.secret.decode() not in repr(keys)
     assert load_keys(tmp_path / "keys") == keys
-    assert keys == Keys(
-        keys.public, keys.secret, server=keys.public, clients=frozenset({keys.public}), directory=tmp_path / "keys"
-    )
+    assert keys == Keys(keys.public, keys.secret, server=keys.public, servers={}, directory=tmp_path / "keys")
     with pytest.raises(ValueError, match="exists already"):
         create_keys(tmp_path / "keys")
     secret_file.chmod(0o640)
