@@ -8,6 +8,8 @@ docs/ros2.md lists the topics.
 
 from __future__ import annotations
 
+import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from steadypose import PACKAGE
@@ -18,8 +20,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.ros2 import check_ros, connect
 from steadypose.nodes.ros2.definitions import Connection, Publish, ros_types
-from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.ros2 import HOST, FoxgloveSettings, Ros2BridgeSettings
+from steadypose.nodes.settings import LaunchError, check_host_and_port
 from steadypose.nodes.sinks.serving import port_taken
 
 if TYPE_CHECKING:
@@ -32,12 +33,49 @@ SILENT_NS = 5_000_000_000
 """Time without a message after which the bodies of a source are removed, nanoseconds."""
 
 
-def check_ros2(launch: Launch) -> None:
-    """Check that ROS 2's topics can be reached.
+HOST = "127.0.0.1"
+"""Address to serve at: this machine only, because poses are personal data. From another machine, use
+``ssh -L 8765:localhost:8765 robot``."""
+_NAMESPACE = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
-    Raises:
-        LaunchError: there is neither a sourced ROS 2 nor Cyclone DDS.
-    """
+
+@dataclass(frozen=True)
+class Ros2BridgeSettings:
+    """``[ros2]``: poses in ROS 2."""
+
+    world_frame: str = "world"
+    """TF frame of pose/world: map, odom, base_link, or a separate frame"""
+    sensor_tf: bool = True
+    """whether to publish the pose of a calibrated sensor; false if the robot's description does"""
+    clock: bool = True
+    """whether to publish /clock during a replay, for nodes with use_sim_time"""
+    namespace: str = ""
+    """namespace of the node and its topics, except /tf, /tf_static, /clock and /diagnostics, which all robots share"""
+
+    def __post_init__(self) -> None:
+        if not self.world_frame or self.world_frame.startswith("/"):
+            raise LaunchError(f"[ros2] world_frame: expected a frame's name without a slash, got {self.world_frame!r}")
+        if self.namespace and not _NAMESPACE.fullmatch(self.namespace):
+            raise LaunchError(
+                f"[ros2] namespace: expected a name such as robot or fleet/robot1, got {self.namespace!r}"
+            )
+
+
+@dataclass(frozen=True)
+class FoxgloveSettings:
+    """``[foxglove]``: poses for Foxglove."""
+
+    port: int = 8765
+    """port of the WebSocket: open ws://localhost:8765 in Foxglove"""
+    world_frame: str = "world"
+    """name of the frame of pose/world"""
+
+    def __post_init__(self) -> None:
+        check_host_and_port("foxglove", HOST, self.port, least=0)
+
+
+def check_ros2(launch: Launch) -> None:
+    """Check that ROS 2's topics can be reached. Raises LaunchError as `check_ros`."""
     check_ros()
 
 
@@ -162,7 +200,8 @@ class Ros2BridgeNode(RosMessagesNode):
             self._output = RosOutput(connection, self._settings.namespace)
             self._topics = BodyTopics(
                 self._output,
-                self._settings,  # pyright: ignore[reportArgumentType]  (one class, found under two names)
+                self._settings.world_frame,
+                sensor_tf=self._settings.sensor_tf,
                 several=bool(self.launch.server.clients),
             )
             print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
@@ -198,11 +237,7 @@ class FoxgloveNode(RosMessagesNode):
         output = FoxgloveOutput(settings.port)
         try:
             self.url = output.url
-            self._topics = BodyTopics(
-                output,
-                Ros2BridgeSettings(world_frame=settings.world_frame),  # pyright: ignore[reportArgumentType]
-                several=bool(self.launch.server.clients),
-            )
+            self._topics = BodyTopics(output, settings.world_frame, several=bool(self.launch.server.clients))
             print(f"Foxglove: {self.url}, layout {LAYOUT.resolve()}", flush=True)
             super().work()
         finally:

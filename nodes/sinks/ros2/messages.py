@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,9 +28,6 @@ from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_a
 from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.posture import RootCovariance
-
-if TYPE_CHECKING:
-    from steadypose.nodes.sinks.ros2 import Ros2BridgeSettings
 
 MARKER_LIFE_S = 0.5
 JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
@@ -220,12 +217,14 @@ class BodyTopics:
 
     Args:
         output: the receiver of the topics.
-        settings: frames and what is published.
+        world_frame: frame of the world.
+        sensor_tf: whether to send the pose of a calibrated sensor.
         several: whether there are several sources, each with ids of its own: names of bodies then contain the source.
     """
 
-    def __init__(self, output: Output, settings: Ros2BridgeSettings, *, several: bool = False) -> None:
-        self._output, self._settings, self._several = output, settings, several
+    def __init__(self, output: Output, world_frame: str, *, sensor_tf: bool = True, several: bool = False) -> None:
+        self._output, self._world_frame = output, world_frame
+        self._sensor_tf, self._several = sensor_tf, several
         self._root_covariance = RootCovariance()
         self._names: dict[str, list[str]] = {}  # of the bodies of each source's newest message
         self._means: dict[str, tuple[int, dict[str, np.ndarray]]] = {}  # number of frames, and mean measures
@@ -239,7 +238,7 @@ class BodyTopics:
             self._send("diagnostics", diagnostic_array(message))
             return 0
         if isinstance(message, PoseEvents | PoseWorld):
-            message = dataclasses.replace(message, frame_id=self._settings.world_frame)
+            message = dataclasses.replace(message, frame_id=self._world_frame)
         topic = OWN_TOPICS[type(message)]
         self._output.send(f"steadypose/{topic}", wire_type(type(message)), encode(message))
         if isinstance(message, PoseClean):
@@ -305,8 +304,8 @@ class BodyTopics:
 
         A late subscriber receives only the last message of /tf_static, so each contains all static sensors.
         """
-        frame, pose, world = clean.frame_id, clean.sensor_pose, self._settings.world_frame
-        if not self._settings.sensor_tf or not clean.calibrated or frame in ("", world):
+        frame, pose, world = clean.frame_id, clean.sensor_pose, self._world_frame
+        if not self._sensor_tf or not clean.calibrated or frame in ("", world):
             return
 
         def placed(frame: str, pose: Pose) -> Any:

@@ -12,8 +12,7 @@ from steadypose.msgs.transport import Publisher
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import deserialise, new, serialise
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.ros2 import HOST
-from steadypose.nodes.sinks.ros2.bridge import FoxgloveNode, FoxgloveOutput
+from steadypose.nodes.sinks.ros2.bridge import HOST, FoxgloveNode, FoxgloveOutput
 
 pytest.importorskip("foxglove", reason="the extra 'foxglove' is not installed")
 

@@ -116,7 +116,7 @@ def test_what_is_said_of_bodies_and_nodes(stream: Stream) -> None:
     kept, world = Kept(), stream[1][-1]
     body = dataclasses.replace(world.bodies[1], covariance=np.diag(np.arange(1, 7) * 1e-4))
     world = dataclasses.replace(world, bodies=[world.bodies[0], body])
-    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="odom"))
+    topics = BodyTopics(kept, "odom")
     topics.send(world)
     topics.send(NEWS)
     (poses,), (markers,) = kept.of("steadypose/poses"), kept.of("steadypose/markers")
@@ -159,7 +159,7 @@ def xyz(point: Any) -> list[float]:
 
 def test_the_whole_message_goes_out_in_its_own_type(stream: Stream) -> None:
     kept = Kept()
-    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
+    topics = BodyTopics(kept, "map")
     clean, world = stream[0][-1], stream[1][-1]
     topics.send(clean)
     topics.send(world)
@@ -170,7 +170,7 @@ def test_the_whole_message_goes_out_in_its_own_type(stream: Stream) -> None:
 
 def test_transforms_lead_to_every_link(stream: Stream) -> None:
     kept, buffer, world = Kept(), TransformBuffer(), stream[1][-1]
-    BodyTopics(kept, Ros2BridgeSettings(world_frame="odom")).send(world)
+    BodyTopics(kept, "odom").send(world)
     (told,) = kept.of("tf")
     buffer.add(told, static=False)
     assert {it.child_frame_id for it in told.transforms} == {
@@ -187,7 +187,7 @@ def test_transforms_lead_to_every_link(stream: Stream) -> None:
 
 def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(stream: Stream) -> None:
     kept = Kept()
-    topics = BodyTopics(kept, Ros2BridgeSettings(world_frame="map"))
+    topics = BodyTopics(kept, "map")
     pose = Pose(np.array([1.0, 2.0, 1.5]), np.array([0.5, -0.5, 0.5, -0.5]))
     still = dataclasses.replace(stream[0][-1], frame_id="camera", sensor_pose=pose, calibrated=True)
     for _ in range(3):
@@ -208,18 +208,18 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(stream: Stream
     held = [{it.child_frame_id for it in told.transforms} for told in kept.of("tf_static")]
     assert held == [{"camera"}, set(), {"other"}, {"other", "third"}, {"third"}], "each has all that stand still"
     silent = Kept()
-    for settings, message in (
-        (Ros2BridgeSettings(sensor_tf=False), still),
-        (Ros2BridgeSettings(), dataclasses.replace(still, calibrated=False)),
-        (Ros2BridgeSettings(), dataclasses.replace(still, frame_id="world")),
+    for sensor_tf, message in (
+        (False, still),
+        (True, dataclasses.replace(still, calibrated=False)),
+        (True, dataclasses.replace(still, frame_id="world")),
     ):
-        BodyTopics(silent, settings).send(message)
+        BodyTopics(silent, "world", sensor_tf=sensor_tf).send(message)
     assert not silent.of("tf_static")
 
 
 def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(stream: Stream) -> None:
     kept = Kept()
-    topics = BodyTopics(kept, Ros2BridgeSettings())
+    topics = BodyTopics(kept, "world")
     world = stream[1][-1]
     topics.send(world)
     lost = dataclasses.replace(world.bodies[1], tracking=Tracking.LOST)
@@ -232,7 +232,7 @@ def test_who_is_gone_loses_its_topics_and_who_is_lost_is_not_published(stream: S
 
 def test_the_urdf_is_of_mean_lengths_and_changes_with_them_alone(stream: Stream) -> None:
     kept, world, rng = Kept(), stream[1][-1], np.random.default_rng(0)
-    topics, counts = BodyTopics(kept, Ros2BridgeSettings()), []
+    topics, counts = BodyTopics(kept, "world"), []
     for size in (1.0, 1.2):
         for _ in range(200):
             body = world.bodies[1]
@@ -249,7 +249,7 @@ def test_sources_have_bodies_of_their_own_until_they_fall_silent(
     """Of a server's clients, each numbers its bodies from 0."""
     kept, node = Kept(), Ros2BridgeNode(make_launch(nodes='["trajectory", "ros2_bridge"]'), clock)
     node._settings = Ros2BridgeSettings()
-    node._topics = BodyTopics(kept, node._settings, several=True)
+    node._topics = BodyTopics(kept, "world", several=True)
     here, there = (dataclasses.replace(stream[1][-1], source=source) for source in ("hall", "front door"))
     for world in (here, there, here, there):
         node.handle(POSE_WORLD, world)

@@ -46,7 +46,7 @@ def layout() -> dict[str, Any]:
 def sent() -> Kept:
     """All that `launch/ros2.toml` has the bridge send of a calibrated camera that sees two people."""
     kept = Kept()
-    topics = BodyTopics(kept, Launch.read("ros2").settings(Ros2BridgeSettings))
+    topics = BodyTopics(kept, Launch.read("ros2").settings(Ros2BridgeSettings).world_frame)
     last = dict(messages(2.0, bodies=2))
     for message in (last[POSE_CLEAN], last[POSE_WORLD], Diagnostics(1, "prior", Level.WARN, "late", {"dropped": "3"})):
         topics.send(message)
