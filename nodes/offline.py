@@ -22,7 +22,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.key_points import in_sight
 from steadypose.prior.complete.body import Fill, Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.stream import Completion, complete_raws, moved, root_steps
+from steadypose.prior.complete.stream import Completion, along_paths, complete_raws
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.world.pipeline import TrajectoryPipeline
@@ -90,11 +90,10 @@ def complete_source(
         raise LaunchError(f"{frames.path}: expected frames, but none of {len(frames)} could be read")
     completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, began, advanced, seed)
     settings = TrajectorySettings()
-    world, steps = TrajectoryPipeline(settings), root_steps(completion, settings.weights)
-    answers: list[tuple[str, Message]] = []
-    for message in completion.clean:
+    world, answers = TrajectoryPipeline(settings), list[tuple[str, Message]]()
+    for message, moved in zip(completion.clean, along_paths(completion, settings.weights), strict=True):
         answers.append((POSE_CLEAN, message))
-        answers += [(POSE_WORLD, answer) for answer in world.process(moved(message, steps, completion.anchor_ns))]
+        answers += [(POSE_WORLD, answer) for answer in world.process(moved)]
     refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
     bodies = frames.bodies if isinstance(frames, ArraySource) else ()
     problems = [text for text in _problems(raws) if not text.startswith("root_relative")]  # `complete` is for those too

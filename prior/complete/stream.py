@@ -8,7 +8,7 @@ only relative to the root, the trajectory is the integral of the root velocity t
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -210,14 +210,13 @@ def _check_size(body: int, offsets: Floats) -> None:
 def _clean_messages(
     raws: Sequence[PoseRaw], done: list[tuple[Stretch, Completed]], uncertainty: Uncertainty, anchor_ns: int
 ) -> list[PoseClean]:
-    """Build ``pose/clean`` of every grid frame with a body, in the frames of the input."""
+    """Build ``pose/clean`` of every grid frame with a body, in the frames of the input, which is in order."""
     bodies: dict[int, list[CleanBody]] = defaultdict(list)
-    ordered = sorted(raws, key=lambda message: message.stamp_ns)
-    stamps = np.array([message.stamp_ns for message in ordered])
+    stamps = np.array([message.stamp_ns for message in raws])
 
     def context(frame: int) -> PoseRaw:
         at = np.searchsorted(stamps, anchor_ns + frame * PERIOD_NS + PERIOD_NS // 2, side="right") - 1
-        return ordered[max(int(at), 0)]
+        return raws[max(int(at), 0)]
 
     for stretch, completed in done:
         sigma = uncertainty.of(stretch.given)
@@ -258,33 +257,30 @@ def _clean_messages(
     return [*messages, end]
 
 
-def root_steps(completion: Completion, weights: str) -> dict[tuple[int, int], Floats]:
-    """Return displacements (3,) metres, by id and grid frame, of bodies that are known only relative to their root;
+def along_paths(completion: Completion, weights: str) -> list[PoseClean]:
+    """Return ``pose/clean`` with bodies that are known only relative to their root moved along predicted paths;
     ``weights`` are those of the root velocity network.
     """
-    steps: dict[tuple[int, int], Floats] = {}
     if not completion.centred:
-        return steps
+        return completion.clean
     network = LiveRootVelocity.load(weights)
+    steps: dict[tuple[int, int], Floats] = {}
     for stretch, completed in completion.done:
         if stretch.body in completion.centred:
             joints = completed.positions - completed.positions[:, :1]
             path = root_path(network, joints, completed.rotations[:, 0]) - completed.positions[:, 0]
-            steps |= {(stretch.body, stretch.first + row): step for row, step in enumerate(path)}
-    return steps
-
-
-def moved(message: PoseClean, steps: Mapping[tuple[int, int], Floats], anchor_ns: int) -> PoseClean:
-    """Return the message with its bodies moved by `root_steps`."""
-    frame = round((message.stamp_ns - anchor_ns) / PERIOD_NS)
-    turn = rotation_matrix(message.sensor_pose.orientation)
-    bodies = [
-        replace(body, positions=body.positions + turn.T @ step)
-        if (step := steps.get((body.id, frame))) is not None and not message.end_of_stream
-        else body
-        for body in message.bodies
-    ]
-    return replace(message, bodies=bodies)
+            first_ns = completion.anchor_ns + stretch.first * PERIOD_NS
+            steps |= {(stretch.body, first_ns + row * PERIOD_NS): step for row, step in enumerate(path)}
+    moved = []
+    for message in completion.clean:
+        turn = rotation_matrix(message.sensor_pose.orientation)
+        bodies = [
+            body if (step := steps.get((body.id, message.stamp_ns))) is None
+            else replace(body, positions=body.positions + turn.T @ step)
+            for body in message.bodies
+        ]  # fmt: skip
+        moved.append(replace(message, bodies=bodies))
+    return moved
 
 
 def is_root_centred(positions: Floats) -> bool:
@@ -298,39 +294,20 @@ def is_root_centred(positions: Floats) -> bool:
     return bool(spread[0] < STILL_M and spread[1:].max() > MOVING_M)
 
 
-def velocities(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """Predict root velocities (T, 3) m/s, world, frame by frame, of joints (T, 22, 3) metres relative to the root, z
-    up, whose rotations (T, 3, 3) are to the world.
+def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
+    """Integrate the root velocities that the network predicts frame by frame of joints (T, 22, 3) metres relative to
+    the root, z up, whose rotations (T, 3, 3) are to the world.
+
+    Returns the root's path (T, 3) metres, world, which starts above the origin; the lower foot is always on the floor.
     """
     yaw = heading(root_rotations)
     features = velocity_features(joints, np.concatenate([joints[:1], joints[:-1]]), FRAME_S, yaw)
-    state, predicted = network.start(1), np.empty((len(joints), 3))
+    state, velocities = network.start(1), np.empty((len(joints), 3))
     for t, frame in enumerate(features):
         velocity, _, state = network(frame[None], state)
-        predicted[t] = velocity[0]
-    return (yaw_matrix(yaw) @ predicted[..., None])[..., 0]
-
-
-def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:
-    """Return the root's path (T, 3) metres, world, which starts above the origin; the lower foot is always on the
-    floor.
-
-    Arguments are as in `velocities`.
-    """
-    path = np.cumsum(velocities(network, joints, root_rotations), axis=0) * FRAME_S
+        velocities[t] = velocity[0]
+    path = np.cumsum((yaw_matrix(yaw) @ velocities[..., None])[..., 0], axis=0) * FRAME_S
     path -= path[0]
     feet = joints[:, list(CONTACT_JOINTS)[_FEET], 2] - REST_HEIGHT[_FEET]
     path[:, 2] = -feet.min(axis=1)
     return path
-
-
-def bridge(network: LiveRootVelocity, joints: Floats, root_rotations: Floats, ends: Floats) -> Floats:
-    """Return the root's path (K, 3) metres, world, over the last K of T frames, between the first and last row of
-    ``ends`` (K, 3); the other arguments are those of `velocities`.
-
-    The closing error of the integrated velocities is distributed evenly over the frames.
-    """
-    steps = velocities(network, joints, root_rotations)[-len(ends) :] * FRAME_S
-    way = np.cumsum(steps, axis=0)
-    way += ends[0] - way[0]
-    return way + np.linspace(0.0, 1.0, len(way))[:, None] * (ends[-1] - way[-1])
