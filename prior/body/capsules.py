@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import get_skeleton
+from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, REST_POSITIONS, J
 
 REST_HEIGHT = 1.72
@@ -122,9 +122,8 @@ def mount(skeleton: str) -> Mount:
     """
     if skeleton not in _RIDES:
         raise ValueError(f"cannot simulate skeleton '{skeleton}': expected one of {', '.join(_RIDES)}")
-    names = get_skeleton(skeleton).joints
     rides: dict[str, tuple[str, tuple[float, float, float]]] = {}
-    for canonical, source in get_skeleton(skeleton).table.items():
+    for canonical, source in SKELETONS[skeleton].table.items():
         direct = [source] if isinstance(source, str) else list(source)
         if len(direct) == 1:
             rides[direct[0]] = (canonical, (0.0, 0.0, 0.0))
@@ -133,8 +132,8 @@ def mount(skeleton: str) -> Mount:
         other = _RIGHT_NAME.get(name, name.replace("left", "right"))
         if other != name:
             rides[other] = (JOINTS[MIRROR[J[canonical]]], (x, -y, z))
-    joint = np.array([J[rides[name][0]] for name in names])
-    place = np.array([rides[name][1] for name in names])
+    joints, places = zip(*(rides[name] for name in SKELETONS[skeleton].joints), strict=True)
+    joint, place = np.array([J[name] for name in joints]), np.array(places)
     rest = REST_POSITIONS[joint] + place
     # a joint's counterpart is the joint nearest to its mirror image in the rest pose
     apart = np.linalg.norm(rest[:, None] * [1.0, -1.0, 1.0] - rest[None], axis=-1)

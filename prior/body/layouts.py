@@ -66,13 +66,6 @@ class Skeleton:
     interpolated: frozenset[str] = frozenset()
     """canonical joints that are only about where the table has them"""
 
-    def index(self, joint: str) -> int:
-        """Index of a sensor joint by name. Raises KeyError if the skeleton has no such joint."""
-        try:
-            return self.joints.index(joint)
-        except ValueError:
-            raise KeyError(f"skeleton '{self.name}' has no joint '{joint}'; it has {', '.join(self.joints)}") from None
-
     @cached_property
     def to_canonical(self) -> NDArray[np.float64]:
         """(22, J) weights; each row sums to 1, or to 0 if the sensor lacks the joint."""
@@ -81,7 +74,7 @@ class Skeleton:
             weights = {source: 1.0} if isinstance(source, str) else source
             total = sum(weights.values())
             for name, weight in weights.items():
-                matrix[J[joint], self.index(name)] = weight / total
+                matrix[J[joint], self.joints.index(name)] = weight / total
         return matrix
 
     @cached_property
@@ -161,14 +154,6 @@ def _described(name: str, description: object) -> Skeleton:
 def _texts(value: object) -> list[str]:
     """Return the value if it is a list of strings, otherwise an empty list."""
     return list(value) if isinstance(value, list) and all(isinstance(text, str) for text in value) else []
-
-
-def get_skeleton(name: str) -> Skeleton:
-    """Return the skeleton of this name. Raises KeyError if the name is unknown; the message lists the known ones."""
-    try:
-        return SKELETONS[name]
-    except KeyError:
-        raise KeyError(f"unknown skeleton '{name}': expected one of {', '.join(SKELETONS)}") from None
 
 
 def to_canonical(

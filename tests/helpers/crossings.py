@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import PoseRaw, PoseWorld
-from steadypose.prior.body.layouts import get_skeleton, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.clean.identify import Identify
 from steadypose.prior.clean.settings import IdentifySettings
 from steadypose.prior.sim.streams import Stream, make
@@ -39,7 +39,7 @@ def watch(stream: Stream) -> list[Frame]:
     rng = np.random.default_rng(stream.seed)
     raw, truth = make(stream)
     people = _people(raw, truth)
-    skeleton, turn, eye = get_skeleton(stream.camera.skeleton), stream.camera.orientation, stream.camera.position
+    skeleton, turn, eye = SKELETONS[stream.camera.skeleton], stream.camera.orientation, stream.camera.position
     last_ns: dict[int, int] = {}
     back_ns: dict[int, int] = {}
     frames = []

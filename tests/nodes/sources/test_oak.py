@@ -161,7 +161,7 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     assert len(worlds) == 12
     assert (news["camera"], news["state"], news["camera.name"]) == ("streaming", "running", "oak-test")
     assert int(news["timeline.stamp_ns"]) == int(news["timeline.wall_ns"])
-    hips = [COCO17.index("left_hip"), COCO17.index("right_hip")]
+    hips = [COCO17.joints.index("left_hip"), COCO17.joints.index("right_hip")]
     path = np.array([one.joints[0][hips].mean(axis=0)[[0, 2]] for one in scene])
     for world in worlds[4:]:
         seen = world.bodies[0].positions[[JOINTS.index("left_hip"), JOINTS.index("right_hip")]].mean(axis=0)

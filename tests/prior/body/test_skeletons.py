@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from steadypose.prior.body.layouts import COCO17, SKELETONS, add_layouts, get_skeleton, to_canonical
+from steadypose.prior.body.layouts import COCO17, SKELETONS, add_layouts, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, REST_POSITIONS, J
 
 EXPECTED_COUNTS = {
@@ -43,14 +43,13 @@ def test_the_tree_is_symmetric_and_breadth_first() -> None:
 
 
 def test_a_joint_with_a_missing_source_is_unobserved_and_confidence_is_the_least() -> None:
-    coco = get_skeleton("coco17")
     positions = np.random.default_rng(0).normal(size=(5, 17, 3))
     confidence = np.full((5, 17), 0.9)
-    confidence[:, coco.index("left_hip")] = 0.4
-    positions[2, coco.index("right_hip"), 1] = np.inf
-    mapped, trust = to_canonical(coco, positions, confidence)
+    confidence[:, COCO17.joints.index("left_hip")] = 0.4
+    positions[2, COCO17.joints.index("right_hip"), 1] = np.inf
+    mapped, trust = to_canonical(COCO17, positions, confidence)
     hips, shoulders = (
-        (positions[0, coco.index(f"left_{part}")] + positions[0, coco.index(f"right_{part}")]) / 2
+        (positions[0, COCO17.joints.index(f"left_{part}")] + positions[0, COCO17.joints.index(f"right_{part}")]) / 2
         for part in ("hip", "shoulder")
     )
     assert np.allclose(mapped[0, 0], hips + 0.15 * (shoulders - hips))
@@ -64,7 +63,7 @@ def test_a_joint_with_a_missing_source_is_unobserved_and_confidence_is_the_least
 
 @pytest.mark.parametrize("name", ["coco17", "blazepose33", "h36m17", "openpose25", "halpe26", "zed18", "mhr70"])
 def test_pelvis_and_neck_of_a_mean_person_lie_above_hips_and_shoulders(name: str) -> None:
-    skeleton = get_skeleton(name)
+    skeleton = SKELETONS[name]
     joints = np.full((len(skeleton.joints), 3), np.nan)
     for side in ("left", "right"):
         for part in ("hip", "shoulder"):
@@ -81,13 +80,6 @@ def test_only_a_pelvis_and_a_neck_that_are_interpolated_have_an_error_of_their_o
     assert errs["coco17"] == errs["blazepose33"] == {"pelvis", "neck"}
     assert errs["h36m17"] == errs["halpe26"] == {"pelvis"}, "their necks are measured"
     assert errs["smpl22"] == errs["kinect22"] == set()
-
-
-def test_unknown_names_say_what_is_known() -> None:
-    with pytest.raises(KeyError, match="coco17"):
-        get_skeleton("coco18")
-    with pytest.raises(KeyError, match="left_elbow"):
-        get_skeleton("coco17").index("elbow")
 
 
 def test_the_name_of_another_layout_is_refused() -> None:

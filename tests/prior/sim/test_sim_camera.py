@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import rankdata
 
 from steadypose.prior.body.capsules import mount
-from steadypose.prior.body.layouts import CANONICAL, get_skeleton, to_canonical
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.sim.camera import FRAME_ID, Camera, film, segment_gap, sight
 from steadypose.prior.sim.gait import Stand, Turn, Walk, plan
@@ -147,7 +147,7 @@ def test_distance_makes_the_quick_noise_worse() -> None:
 
 @pytest.mark.parametrize("name", ["smpl22", "coco17", "blazepose33", "kinect22"])
 def test_a_sensors_joints_map_back_to_the_canonical_ones(name: str) -> None:
-    skeleton, on_body = get_skeleton(name), mount(name)
+    skeleton, on_body = SKELETONS[name], mount(name)
     body = standing(2.0, 0.0).at(np.array([1.0]))
     sensed = on_body.positions(body.positions, body.orientations, 1.0)
     canonical, _ = to_canonical(skeleton, sensed)
@@ -161,7 +161,7 @@ def test_a_sensors_joints_map_back_to_the_canonical_ones(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["coco17", "blazepose33", "kinect22"])
 def test_counterparts_are_the_same_joint_of_the_other_side(name: str) -> None:
-    skeleton, on_body = get_skeleton(name), mount(name)
+    skeleton, on_body = SKELETONS[name], mount(name)
     np.testing.assert_array_equal(on_body.mirror[on_body.mirror], np.arange(len(skeleton.joints)))
     for joint, other in zip(skeleton.joints, (skeleton.joints[m] for m in on_body.mirror), strict=True):
         swapped = joint.replace("left", "#").replace("right", "left").replace("#", "right")

@@ -19,7 +19,7 @@ def archive(tmp_path: Path) -> Path:
     counts = np.round(markers * 1e4).astype(np.int16)
     counts[5, names.index("LWRA")] = -32768
     kinect = np.zeros((len(counts), 22, 3), dtype=np.int16)
-    kinect[:, KINECT22.index("Waist")] = [1000, 9000, -25000]  # y up, 2.5 m in front, looking along -z
+    kinect[:, KINECT22.joints.index("Waist")] = [1000, 9000, -25000]  # y up, 2.5 m in front, looking along -z
     arrays = {}
     for name in ("m02_s01_e01", "m01_s01_e01_inc", "m01_s07_e01"):
         arrays[f"{name}/kinect"], arrays[f"{name}/vicon_markers"] = kinect, counts
@@ -33,7 +33,7 @@ def test_pairs_are_metric_z_up_and_in_order(archive: Path) -> None:
     assert [p.name for p in pairs] == ["m01_s01_e01_inc", "m02_s01_e01", "m01_s07_e01"]
     pair = pairs[1]
     assert (pair.subject, pair.movement, pair.fps) == ("s01", "m02", 30.0)
-    np.testing.assert_allclose(pair.kinect[0, KINECT22.index("Waist")], [0.1, 2.5, 0.9])
+    np.testing.assert_allclose(pair.kinect[0, KINECT22.joints.index("Waist")], [0.1, 2.5, 0.9])
     np.testing.assert_allclose(pair.vicon[0, J["left_hip"]], HIP, atol=2e-4)
     lost = np.argwhere(np.isnan(pair.vicon).any(axis=-1))
     assert [(int(t), JOINTS[j]) for t, j in lost] == [(5, "left_wrist")]
