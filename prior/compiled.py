@@ -11,7 +11,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core.caching import _Cache
+from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.environment import Environment
 from numba.core.runtime.nrt import rtsys
@@ -20,7 +20,7 @@ from numba.core.serialize import dumps
 from steadypose.prior import loop_cache
 
 
-class _LoopCache(_Cache):
+class _LoopCache(NullCache):
     """The cache in which a numba dispatcher looks for compiled code."""
 
     def __init__(self, dispatcher: Any) -> None:
@@ -43,16 +43,6 @@ class _LoopCache(_Cache):
             *parts, environments = data._reduce()
             kept = (*parts, tuple(map(_without_globals, environments)))
             loop_cache.save(self._name(key), dumps((key, kept)))
-
-    @property
-    def cache_path(self) -> Any:
-        return str(loop_cache.writable())
-
-    def enable(self) -> None: ...
-
-    def disable(self) -> None: ...
-
-    def flush(self) -> None: ...
 
     def _key(self, sig: Any, codegen: Any) -> tuple[object, ...]:
         return loop_cache.digest(self._dispatcher), sig, codegen.magic_tuple()
