@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -77,7 +77,6 @@ def describe(table: Mapping[str, Any]) -> Description:
     return described
 
 
-@documented
 def read_motion(name: str, content: bytes, description: Description = UNDESCRIBED) -> Motion:
     """Read the content of a motion file in the format of its name's suffix, one of `SUFFIXES`; ``description`` has what
     the file lacks.
@@ -89,7 +88,7 @@ def read_motion(name: str, content: bytes, description: Description = UNDESCRIBE
         raise MotionError(f"{name}: expected one of {', '.join(SUFFIXES)}")
     try:
         fps, skeleton, positions, up = documented(_READERS[suffix])(content, description)
-    except (MotionError, RigError) as error:
+    except MotionError as error:
         raise MotionError(f"{name}: {error}") from error
     body = to_canonical(skeleton, positions)[0]
     return Motion(description.fps or fps, body @ TO_Z_UP[description.up or up or up_axis(body)].T)
@@ -129,21 +128,14 @@ def _bvh(content: bytes, description: Description) -> _Read:
     return bvh.fps, rig.skeleton, positions * (description.metres or rig.metres), rig.up
 
 
-@documented
-def read_amass(file: IO[bytes]) -> tuple[float, Floats]:
+def _amass(content: bytes, _: Description) -> _Read:
     """Read SMPL, SMPL-H or SMPL-X poses as stored by AMASS: ``poses``, ``trans`` and the frame rate.
 
     No body model is used, so its licence does not apply. The rotations are applied to the rest skeleton of
     `prior.body.skeleton`, a generic adult, for any subject. Joint angles are those of the recording; bone lengths and
     the height of the root above the floor are not.
-
-    Returns:
-        Frames per second, and canonical joints (T, 22, 3) metres, z up.
-
-    Raises:
-        MotionError: an array is missing or has another shape.
     """
-    with open_npz(file, "poses", "trans") as archive:
+    with open_npz(io.BytesIO(content), "poses", "trans") as archive:
         rate = next((k for k in ("mocap_framerate", "mocap_frame_rate") if k in archive), None)
         if rate is None:
             raise MotionError("expected an array mocap_framerate (or mocap_frame_rate, as SMPL-X' files name it)")
@@ -156,12 +148,7 @@ def read_amass(file: IO[bytes]) -> tuple[float, Floats]:
     # SMPL's rest pose faces +z with y up; ours faces +x with z up
     steps = np.tile(REST_OFFSETS[:, [1, 2, 0]], (len(poses), 1, 1))
     steps[:, 0] = trans
-    return fps, forward(PARENTS, steps, local)[0]
-
-
-def _amass(content: bytes, _: Description) -> _Read:
-    fps, positions = read_amass(io.BytesIO(content))
-    return fps, CANONICAL, positions, "z"
+    return fps, CANONICAL, forward(PARENTS, steps, local)[0], "z"
 
 
 def _array(content: bytes, description: Description) -> _Read:

@@ -14,7 +14,7 @@ from steadypose.nodes.sources.key_points import check_up, read_key_points
 from steadypose.nodes.sources.npz import NpzError
 from steadypose.prior.fit import solve
 from steadypose.prior.fit.solve import FitSettings
-from steadypose.prior.mocap.files import read_amass
+from steadypose.prior.mocap.files import read_motion
 
 FRAMES = 24
 POSITIONS = walked(FRAMES)
@@ -116,8 +116,7 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
     np.savez(tmp_path / "model.npz", **model_arrays())
     assert main(["fit", str(seen), str(tmp_path / "out.npz"), "--smpl", str(tmp_path / "model.npz")]) == 0
     assert "mean distance of SMPL's joints" in capsys.readouterr().err
-    with (tmp_path / "out.npz.smpl.0.npz").open("rb") as file:
-        fps, read = read_amass(file)
+    fps, read = read_motion("smpl.npz", (tmp_path / "out.npz.smpl.0.npz").read_bytes())
     with np.load(tmp_path / "out.npz") as out:
         said = out["world_positions"]
     assert fps == 30.0

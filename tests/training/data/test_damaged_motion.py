@@ -17,7 +17,7 @@ from tests.helpers.motion_files import npz as archive
 from steadypose.prior import npz
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.prior.mocap.files import read_amass
+from steadypose.prior.mocap.files import read_motion
 from steadypose.prior.npz import check_arrays
 from steadypose.training.data.cmu import read_amc, read_asf
 
@@ -27,7 +27,7 @@ READERS: dict[str, tuple[str | bytes, Callable]] = {
     "bvh": (bvh_text(), lambda text: read_bvh(text).positions()),
     "asf": (ASF, read_asf),
     "amc": (AMC, lambda text: read_amc(text, read_asf(ASF))),
-    "amass": (archive(**AMASS).getvalue(), lambda content: read_amass(io.BytesIO(content))),
+    "amass": (archive(**AMASS).getvalue(), lambda content: read_motion("a.npz", content)),
 }
 
 
@@ -92,8 +92,9 @@ def test_what_is_no_motion_is_refused_in_words(kind: str, pattern: str, instead:
     ],
 )
 def test_what_amass_would_not_hold_is_refused_in_words(arrays: dict[str, Any], message: str) -> None:
+    given = {name: array for name, array in (AMASS | arrays).items() if array is not None}
     with pytest.raises(MotionError, match=message):
-        read_amass(archive(**{name: array for name, array in (AMASS | arrays).items() if array is not None}))
+        read_motion("a.npz", archive(**given).getvalue())
 
 
 def bomb(shape: tuple[int, ...]) -> io.BytesIO:
@@ -109,7 +110,7 @@ def bomb(shape: tuple[int, ...]) -> io.BytesIO:
 
 def test_an_array_is_no_larger_than_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MotionError, match=r"poses: expected \(100000, 66\) float64, found \d+ bytes"):
-        read_amass(bomb((100_000, 66)))
+        read_motion("a.npz", bomb((100_000, 66)).getvalue())
     monkeypatch.setattr(npz, "MAX_BYTES", 2**22)
     large = tmp_path / "large.npz"
     with zipfile.ZipFile(large, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("x.npy", "w") as entry:

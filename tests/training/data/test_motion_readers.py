@@ -10,7 +10,7 @@ from tests.helpers.motion_files import AMC, ASF, bvh_text, npz
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
-from steadypose.prior.mocap.files import read_amass
+from steadypose.prior.mocap.files import read_motion
 from steadypose.training.data.cmu import read_amc, read_asf, read_expmap
 
 
@@ -130,7 +130,7 @@ def test_amass_rest_pose_stands_upright_facing_where_it_is_turned() -> None:
     poses[:, :3] = [np.pi / 2, 0, 0]
     poses[2, 3 * J["left_knee"] : 3 * J["left_knee"] + 3] = [np.pi / 2, 0, 0]
     trans = np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1]], dtype=float)
-    fps, positions = read_amass(npz(poses=poses, trans=trans, mocap_framerate=120.0))
+    fps, positions = read_motion("a.npz", npz(poses=poses, trans=trans, mocap_framerate=120.0).getvalue())
     assert fps == 120
     # Facing -y: forward of the rest skeleton to -y, its left to +x.
     bones = positions[:2, 1:] - positions[:2, list(PARENTS[1:])]
