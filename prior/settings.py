@@ -25,9 +25,10 @@ UNUSED = {"prior.impute": ("steps", "rate")}
 def current_key(path: str) -> str:
     """Return the current name of a setting's path, such as ``prior.bones.samples``, with or without its section."""
     for old, new in RENAMED.items():
-        for former, name in ((old, new), (old.partition(".")[2], new.partition(".")[2])):
+        (section, _, was), now = old.partition("."), new.partition(".")[2]
+        for former, name in ((old, new), (was, now)):
             if f"{path}.".startswith(f"{former}."):
-                _warn_of_former_name(old, new)
+                _warn_once(f"[{section}] {was} is now called {now}: write that; a later version refuses {was}")
                 return name + path[len(former) :]
     return path
 
@@ -44,24 +45,16 @@ def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
         if name != key and name in settings:
             raise ValueError(f"[{section}] {key} is the former name of {name}: expected one of the two")
         if unused := [k for k in UNUSED.get(f"{section}.{key}", ()) if isinstance(value, Mapping) and k in value]:
-            _warn_of_unused(f"{section}.{key}", ", ".join(unused))
+            keys = ", ".join(unused)
+            _warn_once(f"[{section}.{key}] {keys}: no longer used, and to be refused by a later version")
             value = {k: v for k, v in value.items() if k not in unused}
         current[name] = value
     return current
 
 
 @cache
-def _warn_of_former_name(old: str, new: str) -> None:
-    """Warn of a former name, once per process."""
-    section, _, key = old.partition(".")
-    logger.warning(
-        "[%s] %s is now called %s: write that; a later version refuses %s", section, key, new.partition(".")[2], key
-    )
-
-
-@cache
-def _warn_of_unused(section: str, keys: str) -> None:
-    logger.warning("[%s] %s: no longer used, and to be refused by a later version", section, keys)
+def _warn_once(text: str) -> None:
+    logger.warning(text)
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:

@@ -15,7 +15,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.prior.clean.settings import PersonSettings, PriorSettings
-from steadypose.prior.settings import _warn_of_former_name
+from steadypose.prior.settings import _warn_once
 
 
 @pytest.fixture
@@ -201,7 +201,7 @@ def test_brackets_without_end_are_no_setting(write) -> None:
     ],
 )
 def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str, former: list[str]) -> None:
-    _warn_of_former_name.cache_clear()
+    _warn_once.cache_clear()
     launch = Launch.read(write(text), [full_key(override, pipeline_sections())])
     assert launch.settings(PriorSettings).person == PersonSettings(samples=40, every=4)
     warned = [record.getMessage().split()[1] for record in caplog.records]
@@ -209,7 +209,7 @@ def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str,
 
 
 def test_former_names_elsewhere(write, caplog: pytest.LogCaptureFixture) -> None:
-    _warn_of_former_name.cache_clear()
+    _warn_once.cache_clear()
     address = "tcp://127.0.0.1:7111"
     file = write(f"nodes = ['prior']\n[server]\nkiosks = ['{address}']\n[transport]\nlossless = false")
     assert Launch.read(file).server.clients == [address]
