@@ -34,8 +34,6 @@ class BodyEstimate:
 
     observed: BodyObservation
     """the input"""
-    velocity: RootVelocity | None
-    """predicted root velocity; None if the network is off"""
     contacts: Contacts
     """predicted contacts"""
     guessed: Bools
@@ -77,11 +75,6 @@ class Scene:
         self.stamp_ns = stamp_ns
         self.bodies = {i: b for i, b in self.bodies.items() if stamp_ns - b.observed.stamp_ns <= timeout_ns}
 
-    @property
-    def last(self) -> dict[int, BodyObservation]:
-        """The newest observation of each body, by id."""
-        return {i: body.observed for i, body in self.bodies.items()}
-
 
 class WorldCore:
     """Turns observations into estimates. It holds the networks and no other state.
@@ -114,7 +107,7 @@ class WorldCore:
             scene.floor.update(now, holding.rest, guessed[FEET_OF_LEGS])
             root = body.filter.update(now, velocity, holding, scene.floor)
             feet = body.feet.update(now, root, holding.rest, scene.floor)
-            estimates.append(BodyEstimate(now, velocity, contacts, guessed, holding, root, feet))
+            estimates.append(BodyEstimate(now, contacts, guessed, holding, root, feet))
         return estimates
 
     def _stages(self, scene: Scene, observed: BodyObservation) -> BodyStages:

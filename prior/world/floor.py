@@ -98,12 +98,15 @@ class Floor:
 
     Args:
         calibrated: whether the floor is known to be at z = 0.
+
+    Attributes:
+        height: metres, world, height of the floor; 0 while unknown.
     """
 
     def __init__(self, calibrated: bool) -> None:
         self._calibrated = calibrated
         self._levels: list[Level] = []
-        self._height = 0.0
+        self.height = 0.0
         self._variance = CALIBRATED_SIGMA**2 if calibrated else math.inf
         self._elsewhere_s = 0.0
 
@@ -111,11 +114,6 @@ class Floor:
     def known(self) -> bool:
         """Whether the floor has an estimate."""
         return math.isfinite(self._variance)
-
-    @property
-    def height(self) -> float:
-        """Height of the floor, metres, world; 0 while unknown."""
-        return self._height
 
     @property
     def sigma(self) -> float:
@@ -130,13 +128,13 @@ class Floor:
     @property
     def plane(self) -> Floats:
         """(4,) coefficients a, b, c, d of the ground plane ax + by + cz + d = 0, with the unit normal (a, b, c) up."""
-        return np.array([0.0, 0.0, 1.0, -self._height])
+        return np.array([0.0, 0.0, 1.0, -self.height])
 
     def under(self, sole: Floats) -> float:
         """Height of the ground near a sole at (3,) metres, metres, world; NaN if no known ground is near."""
         if not self.known:
             return math.nan
-        heights = [self._height, *(level.height for level in self._levels if level.reaches(sole[:2]))]
+        heights = [self.height, *(level.height for level in self._levels if level.reaches(sole[:2]))]
         near = min(heights, key=lambda height: abs(height - sole[2]))
         return near if sole[2] - near < STEP_M else math.nan
 
@@ -158,7 +156,7 @@ class Floor:
     def guess(self, lowest: float) -> None:
         """Start at the height of the lowest observed foot, metres, as if it stood on the floor."""
         if not self.known:
-            self._height, self._variance = lowest, GUESS_SIGMA**2
+            self.height, self._variance = lowest, GUESS_SIGMA**2
 
     def observe(self, sole: Floats, sigma: float, dt: float) -> None:
         """Update with the point (3,) metres, world, of one standing foot's sole, the deviation of its height, and the
@@ -166,26 +164,26 @@ class Floor:
         """
         height = float(sole[2])
         if not self.known:
-            self._height, self._variance = height, sigma**2
+            self.height, self._variance = height, sigma**2
             return
         for level in self._levels:
             level.idle_s += dt
         self._levels = [level for level in self._levels if level.idle_s < FORGOTTEN_S]
         self._variance += CREEP**2 * dt
-        sigmas_off = (height - self._height) / math.sqrt(self._variance + sigma**2)
-        if sigmas_off > GATE and height - self._height > STEP_M:
+        sigmas_off = (height - self.height) / math.sqrt(self._variance + sigma**2)
+        if sigmas_off > GATE and height - self.height > STEP_M:
             self._observe_level(sole, sigma, dt)
         if sigmas_off > GATE:
             self._elsewhere_s += dt
             if self._elsewhere_s > PATIENCE_S and not self._calibrated:
-                self._height, self._variance, self._elsewhere_s = height, GUESS_SIGMA**2, 0.0
+                self.height, self._variance, self._elsewhere_s = height, GUESS_SIGMA**2, 0.0
                 self._levels = [level for level in self._levels if level.height > height + STEP_M]
             return
         self._elsewhere_s = 0.0
         if sigmas_off < -GATE:
             self._variance = max(self._variance, sigma**2)
         gain = self._variance / (self._variance + sigma**2 * max(MEMORY_S / dt, 1.0))
-        self._height += gain * (height - self._height)
+        self.height += gain * (height - self.height)
         self._variance *= 1.0 - gain
 
     def _observe_level(self, sole: Floats, sigma: float, dt: float) -> None:

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
@@ -79,7 +79,8 @@ class BodyFilter:
     """Kalman filter of root position and velocity, positions of ``feet`` points of the feet, and biases.
 
     It starts from the first observed position (3,) of the root, metres, and a velocity (3,) m/s; ``jitter`` and
-    ``bias`` are deviations of the sensor's error from frame to frame and of its slow one, metres.
+    ``bias`` are deviations of the sensor's error from frame to frame and of its slow one, metres. ``placed`` (feet,)
+    says which feet have a position.
     """
 
     def __init__(
@@ -97,7 +98,7 @@ class BodyFilter:
         for k in range(feet):
             errors += [_index(k, _FOOT_ERROR), _index(k, _FOOT_RATE)]
         self._p[:, errors, errors] = 1.0
-        self._placed = np.zeros(feet, dtype=bool)
+        self.placed = np.zeros(feet, dtype=bool)
         self._from_root = np.zeros(feet, dtype=bool)
 
     @property
@@ -122,11 +123,6 @@ class BodyFilter:
     def position_sigma(self) -> Floats:
         """(3,) metres, standard deviation along each axis."""
         return np.sqrt(self._p[:, _POSITION, _POSITION])
-
-    @property
-    def placed(self) -> NDArray[np.bool_]:
-        """(feet,) which feet have a position."""
-        return self._placed.copy()
 
     @property
     def feet(self) -> Floats:
@@ -171,7 +167,7 @@ class BodyFilter:
         The position has both errors of the sensor. Errors relative to the root differ from those in the world, so a
         change between the two forgets the learned error.
         """
-        if not self._placed[foot]:
+        if not self.placed[foot]:
             self._place(foot, place + self._x[_POSITION] if from_root else place, jitter, bias, from_root)
             return
         if self._from_root[foot] != from_root:
@@ -186,7 +182,7 @@ class BodyFilter:
 
     def lose(self, foot: int) -> None:
         """Forget the position of a foot."""
-        self._placed[foot] = False
+        self.placed[foot] = False
 
     def _place(self, foot: int, place: Floats, jitter: float, bias: float, from_root: bool) -> None:
         """Initialise a foot at its first observation."""
@@ -199,7 +195,7 @@ class BodyFilter:
             p[:, :, at] = p[:, :, _POSITION]
         p[:, at, at] = p[:, _POSITION, _POSITION] * from_root + jitter**2 + bias**2
         p[:, at, error] = p[:, error, at] = -bias
-        self._placed[foot], self._from_root[foot] = True, from_root
+        self.placed[foot], self._from_root[foot] = True, from_root
 
     def _forget_error(self, foot: int) -> None:
         for part in (_index(foot, _FOOT_ERROR), _index(foot, _FOOT_RATE)):

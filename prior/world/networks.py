@@ -7,9 +7,11 @@ and rest; they decide which feet may anchor the root.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
@@ -41,13 +43,12 @@ class RootVelocity(NamedTuple):
     """(3,) m/s, standard deviation, calibrated on validation"""
 
 
+@dataclass
 class MotionMemory:
-    """State of the velocity network for one body: its last joints, and the hidden state (hidden,)."""
+    """State of the velocity network for one body: its hidden state (hidden,), and its last joints."""
 
-    def __init__(self, hidden: int) -> None:
-        self._hidden = hidden
-        self.local: Floats | None = None
-        self.state = np.zeros(hidden, dtype=np.float32)
+    state: NDArray[np.float32]
+    local: Floats | None = None
 
     def update(self, observed: BodyObservation) -> tuple[Floats, Floats, float]:
         """Return this frame's and the last frame's joints (22, 3), metres from the root, world axes, and the seconds
@@ -60,7 +61,7 @@ class MotionMemory:
         local = observed.positions - observed.positions[0]
         self.local = local = np.where(np.isfinite(local), local, last)
         if before is None or observed.after_gap:
-            self.state = np.zeros(self._hidden, dtype=np.float32)
+            self.state = np.zeros_like(self.state)
             return local, local, FRAME_S
         return local, last, max(observed.dt, FRAME_S)
 
@@ -78,7 +79,7 @@ class VelocityNetwork:
 
     def memory(self) -> MotionMemory:
         """Return the state of a new body."""
-        return MotionMemory(self._net.config.hidden)
+        return MotionMemory(np.zeros(self._net.config.hidden, dtype=np.float32))
 
     def update(self, memories: Sequence[MotionMemory], observed: Sequence[BodyObservation]) -> list[RootVelocity]:
         """Predict the velocity of each body, and update the bodies' ``memories``."""
@@ -117,12 +118,12 @@ def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> S
     return Stance(*(holds * p[_FOOT_CONTACTS].astype(np.float64) for p in (contacts.load, contacts.rest)))
 
 
+@dataclass
 class ContactMemory:
-    """State of the contact network for one body: its last observation, and the hidden state (hidden,)."""
+    """State of the contact network for one body: its hidden state (hidden,), and its last observation."""
 
-    def __init__(self, hidden: int) -> None:
-        self.observed: BodyObservation | None = None
-        self.state = np.zeros(hidden, dtype=np.float32)
+    state: NDArray[np.float32]
+    observed: BodyObservation | None = None
 
 
 class ContactNetwork:
@@ -133,7 +134,7 @@ class ContactNetwork:
 
     def memory(self) -> ContactMemory:
         """Return the state of a new body."""
-        return ContactMemory(self._net.hidden)
+        return ContactMemory(np.zeros(self._net.hidden, dtype=np.float32))
 
     def update(
         self, memories: Sequence[ContactMemory], observed: Sequence[BodyObservation], floor: Floor

@@ -31,18 +31,19 @@ class TrajectoryPipeline:
 
     Attributes:
         counters: numbers of messages and bodies refused, and of sources forgotten, by cause.
+        scenes: state of each source, the least recently received first.
     """
 
     def __init__(self, settings: TrajectorySettings) -> None:
         self.counters: Counter[str] = Counter()
         self._core, self._lost_sigma = WorldCore(settings), settings.lost_sigma
         self._timeout_ns = round(settings.timeout_s * 1e9)
-        self._scenes: dict[str, Scene] = {}  # least recently received first
+        self.scenes: dict[str, Scene] = {}
 
     def process(self, clean: PoseClean) -> list[PoseWorld]:
         """Return the ``pose/world`` message for a ``pose/clean`` message; none if it was refused (see `counters`)."""
         if clean.end_of_stream:
-            return [_message(clean, self._scenes.pop(clean.source, None) or Scene(clean.calibrated), [])]
+            return [_message(clean, self.scenes.pop(clean.source, None) or Scene(clean.calibrated), [])]
         orientation, position = unit_quaternion(clean.sensor_pose.orientation), clean.sensor_pose.position
         if orientation is None or not np.isfinite(position).all():
             self.counters["sensor_pose_invalid"] += 1
@@ -50,15 +51,12 @@ class TrajectoryPipeline:
         scene = self._scene(clean)
         if scene is None:
             return []
-        observations = observe(self._named(clean.bodies), clean.stamp_ns, orientation, position, scene.last)
+        last = {name: body.observed for name, body in scene.bodies.items()}
+        observations = observe(self._named(clean.bodies), clean.stamp_ns, orientation, position, last)
         estimates = self._core.step(scene, observations)
         if len(estimates) < len(observations):
             self.counters["body_without_root"] += len(observations) - len(estimates)
         return [_message(clean, scene, self._composed(scene, estimates))]
-
-    def scene(self, source: str) -> Scene | None:
-        """The state of a source; None if it is unknown, ended or forgotten."""
-        return self._scenes.get(source)
 
     def _named(self, bodies: Sequence[CleanBody]) -> list[CleanBody]:
         """Return the first body with each id."""
@@ -83,17 +81,17 @@ class TrajectoryPipeline:
 
     def _scene(self, clean: PoseClean) -> Scene | None:
         """Return the source's scene without bodies that timed out; None if the message is out of order."""
-        scene, stamp_ns = self._scenes.pop(clean.source, None), clean.stamp_ns
+        scene, stamp_ns = self.scenes.pop(clean.source, None), clean.stamp_ns
         if scene is not None and stamp_ns < scene.stamp_ns - self._timeout_ns:
             self.counters["stamp_jumped_back"] += 1
             scene = None
         late = scene is not None and stamp_ns <= scene.stamp_ns
         if scene is None or (scene.calibrated != clean.calibrated and not late):
             scene = Scene(clean.calibrated)
-        self._scenes[clean.source] = scene
-        if len(self._scenes) > MAX_SOURCES:
+        self.scenes[clean.source] = scene
+        if len(self.scenes) > MAX_SOURCES:
             self.counters["source_forgotten"] += 1
-            del self._scenes[next(iter(self._scenes))]
+            del self.scenes[next(iter(self.scenes))]
         if late:
             self.counters["stamp_repeated" if stamp_ns == scene.stamp_ns else "stamp_out_of_order"] += 1
             return None

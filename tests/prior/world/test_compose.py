@@ -108,7 +108,7 @@ def composed(
     contacts = Contacts(ramp, ramp[::-1], ramp[:1])
     rest = np.array([0.9, 0.0, 0.0, 0.8])
     feet = FeetState(heels, np.full(4, 0.03))
-    estimate = BodyEstimate(observed, None, contacts, np.array(guessed), Stance(rest, rest), root, feet)
+    estimate = BodyEstimate(observed, contacts, np.array(guessed), Stance(rest, rest), root, feet)
     return compose(estimate, lost_sigma), estimate
 
 

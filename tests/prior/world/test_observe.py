@@ -133,7 +133,7 @@ def test_feet_may_anchor_if_they_have_not_moved_and_they_or_the_root_are_observe
 
 
 def test_motion_is_read_from_the_root_and_a_joint_that_is_lost_stays_where_it_was() -> None:
-    memory, wrist = MotionMemory(2), J["left_wrist"]
+    memory, wrist = MotionMemory(np.zeros(2, np.float32)), J["left_wrist"]
     rotations = np.tile([0.0, 0.0, 0.6, 0.8], (22, 1))
     lost = STANDING.copy()
     lost[wrist] = np.nan

@@ -213,8 +213,7 @@ def test_sources_are_forgotten_beyond_a_limit_the_longest_unheard_first():
     for k in range(500):
         pipeline.process(replace(stream()[0], source=f"camera {k}", bodies=[]))
         pipeline.process(replace(stream()[0], source="camera 0", stamp_ns=k + 1, bodies=[]))
-    kept = [k for k in range(500) if pipeline.scene(f"camera {k}")]
-    assert kept == [0, *range(501 - MAX_SOURCES, 500)]
+    assert set(pipeline.scenes) == {f"camera {k}" for k in (0, *range(501 - MAX_SOURCES, 500))}
     assert pipeline.counters["source_forgotten"] == 500 - MAX_SOURCES
 
 
@@ -228,9 +227,7 @@ def test_nothing_of_a_body_is_left_in_the_one_that_has_its_id_next(seed: int):
         positions[rng.random(22) < 0.2] = np.nan
         fields = {"positions": positions, "state": rng.integers(0, 4, 22).astype(np.uint8), "sigma": rng.random(22)}
         pipeline.process(changed(stream()[t], fields))
-    scene = pipeline.scene(stream()[0].source)
-    assert scene
-    scene.floor = Floor(calibrated=True)
+    pipeline.scenes[stream()[0].source].floor = Floor(calibrated=True)
     later = [replace(m, stamp_ns=m.stamp_ns + 2 * 10**9) for m in stream()[:12]]
     assert [w for m in later for w in pipeline.process(m)] == run(later)
 
@@ -312,8 +309,7 @@ def told(name: str, calibrated: bool):
     messages = [replace(m, calibrated=calibrated) for m in observe(clip, np.random.default_rng(0))]
     bodies = [world.bodies[0] for message in messages for world in pipeline.process(message)]
     assert {body.tracking for body in bodies} == {Tracking.OK}
-    scene = pipeline.scene(messages[0].source)
-    assert scene
+    scene = pipeline.scenes[messages[0].source]
     seen = np.array([message.bodies[0].positions for message in messages])
     return clip.positions, seen, np.array([body.positions for body in bodies]), scene.floor.height, scene.floor.levels
 
