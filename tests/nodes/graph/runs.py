@@ -14,7 +14,7 @@ from conftest import until
 
 from steadypose.nodes.graph.run_state import HEALTH_FILE
 
-INPUT_ALONE = ("--set", 'nodes=["pose_input"]')
+INPUT_ALONE = ("--set", 'nodes=["pose_input"]', "--set", "recorder.free_mb=0")
 
 
 class Run:

@@ -58,7 +58,7 @@ def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(s
 def recorded(start: Any, recording: Path, tmp_path: Path) -> tuple[Run, list[int]]:
     """A run without end of an input and a recorder, which has poses by now, and the ids of their processes."""
     where = ("--input", str(recording), "--record", str(tmp_path / "out"), "--loop")
-    run: Run = start(*where, *INPUT_ALONE, "--set", "recorder.free_mb=0")
+    run: Run = start(*where, *INPUT_ALONE)
     until(lambda: poses_recorded(tmp_path / "out"), timeout_s=120)
     return run, [run.pid(name) for name in ("pose_input", "recorder")]
 
@@ -106,10 +106,7 @@ def test_a_node_that_cannot_start_ends_the_run(start: Any, recording: Path, tmp_
 
 def test_the_recorder_is_killed_and_goes_on_in_the_next_part(start: Any, recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    run: Run = start(
-        "--input", str(recording), "--record", str(out), "--loop", *INPUT_ALONE,
-        "--set", "recorder.free_mb=0",
-    )  # fmt: skip
+    run: Run = start("--input", str(recording), "--record", str(out), "--loop", *INPUT_ALONE)
     for part in range(3):
         run.until_running("recorder")
         until(lambda: len(list(out.glob("*.mcap"))) == part + 1, timeout_s=30)  # noqa: B023
@@ -154,10 +151,7 @@ def test_an_input_that_is_killed_goes_on_where_it_was(start: Any, tmp_path: Path
     frames = walk(150)
     record(tmp_path / "in", frames)
     out = tmp_path / "out"
-    run: Run = start(
-        "--input", str(tmp_path / "in"), "--record", str(out), *INPUT_ALONE,
-        "--set", "recorder.free_mb=0",
-    )  # fmt: skip
+    run: Run = start("--input", str(tmp_path / "in"), "--record", str(out), *INPUT_ALONE)
     run.until_running("recorder")
     until(lambda: sum(file.stat().st_size for file in out.glob("*.mcap")) > 30_000, timeout_s=30)
     run.kill("pose_input")
@@ -199,10 +193,8 @@ def test_a_camera_whose_process_is_killed(start: Any, tmp_path: Path, monkeypatc
     (tmp_path / "acme.py").write_text(CAMERA)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     out = tmp_path / "out/out_0.mcap"
-    run: Run = start(
-        "--record", str(tmp_path / "out"), *INPUT_ALONE, "--set", "recorder.free_mb=0",
-        "--set", "transport.lossless=false", "--set", "input.source=acme:open_camera",
-    )  # fmt: skip
+    live = ("--set", "transport.lossless=false", "--set", "input.source=acme:open_camera")
+    run: Run = start("--record", str(tmp_path / "out"), *INPUT_ALONE, *live)
     until(lambda: poses_recorded(tmp_path / "out"), timeout_s=60)
     run.kill("pose_input")
     size = out.stat().st_size

@@ -121,7 +121,7 @@ def test_a_damaged_recording_is_played_and_the_exit_status_says_so(start: Any, r
 def test_poses_go_on_where_the_log_cannot_be_written(recording: Path, tmp_path: Path, folder: Path) -> None:
     out = tmp_path / "out"
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
-    arguments = ["run", "--input", recording, "--record", out, *INPUT_ALONE, "--set", "recorder.free_mb=0"]
+    arguments = ["run", "--input", recording, "--record", out, *INPUT_ALONE]
     command = [sys.executable, "-m", "steadypose.nodes.cli", *arguments]
     with open("/dev/full", "w") as full:
         assert subprocess.run(command, stdout=full, stderr=full, env=environment, timeout=240).returncode == 0
@@ -134,9 +134,7 @@ def test_a_path_may_hold_any_character(start: Any, tmp_path: Path) -> None:
     strange.mkdir()
     source = record(strange / "in", walk(30))
     out = strange / "out"
-    run: Run = start(
-        "--input", str(source), "--record", str(out), "--rate", "0", *INPUT_ALONE, "--set", "recorder.free_mb=0"
-    )
+    run: Run = start("--input", str(source), "--record", str(out), "--rate", "0", *INPUT_ALONE)
     status, output = run.wait()
     assert status == 0, output
     with RecordingReader(out) as reader:
@@ -146,9 +144,7 @@ def test_a_path_may_hold_any_character(start: Any, tmp_path: Path) -> None:
 def test_beside_a_file_in_its_place_a_recording_is_made(start: Any, recording: Path, tmp_path: Path) -> None:
     taken = tmp_path / "mine.npz"
     taken.touch()
-    run: Run = start(
-        "--input", str(recording), "--record", str(taken), "--rate", "0", *INPUT_ALONE, "--set", "recorder.free_mb=0"
-    )
+    run: Run = start("--input", str(recording), "--record", str(taken), "--rate", "0", *INPUT_ALONE)
     status, output = run.wait()
     assert status == 0, output
     assert f"recording to {taken}-2: mine.npz is there already" in output

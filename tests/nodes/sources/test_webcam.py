@@ -318,21 +318,31 @@ def filmed(camera: str, hidden: range) -> list[PoseRaw]:
     return messages
 
 
-def test_two_cameras_become_one(folder: Path, clock: VirtualClock) -> None:
+@contextmanager
+def merging(
+    folder: Path, clock: VirtualClock
+) -> Iterator[tuple[MergeSource, Iterator[PoseRaw | None], list[Publisher]]]:
+    """A source that merges two cameras, its frames, and the publishers that it listens to."""
     addresses = [f"ipc://{folder}/{name}" for name in PLACES]
     source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
-    frames, merged = source.frames(), []
+    frames = source.frames()
     with Publisher(addresses[0]) as left, Publisher(addresses[1]) as right:
         assert next(frames) is None
         for publisher in (left, right):
             assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
+        yield source, frames, [left, right]
+    frames.close()
+
+
+def test_two_cameras_become_one(folder: Path, clock: VirtualClock) -> None:
+    merged: list[PoseRaw] = []
+    with merging(folder, clock) as (source, frames, publishers):
         for views in zip(filmed("left", range(18, 20)), filmed("right", range(4, 6)), strict=True):
-            for publisher, view in zip((left, right), views, strict=True):
+            for publisher, view in zip(publishers, views, strict=True):
                 publisher.publish(POSE_RAW, view)
                 count = source._received.total()
                 while source._received.total() == count:
                     merged += [frame] if (frame := next(frames)) else []
-    frames.close()
     assert len(merged) >= FRAMES_OF_BOTH - 3
     assert all(m.source == "merged" and m.frame_id == "world" and m.calibrated for m in merged)
     truth = {m.stamp_ns: [b.positions for b in m.bodies] for m in walk(FRAMES_OF_BOTH, bodies=2)}
@@ -345,19 +355,14 @@ def test_two_cameras_become_one(folder: Path, clock: VirtualClock) -> None:
     assert source.status()["camera"] == "2 of 2 cameras heard"
 
 
-def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
-    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
-    source = MergeSource(MergeSettings(addresses), SourceContext(VirtualClock(), CalibrationSettings()))
-    frames, (first, *_, last) = source.frames(), filmed("left", range(0))
-    with Publisher(addresses[0]) as camera:
-        assert next(frames) is None
-        assert camera.wait_for_subscribers({"merge"}, timeout_s=20)
+def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path, clock: VirtualClock) -> None:
+    first, *_, last = filmed("left", range(0))
+    with merging(folder, clock) as (source, frames, (camera, _)):
         camera.publish(POSE_RAW, first)
         camera.deliveries.sequence[POSE_RAW] += 3  # which nobody heard
         camera.publish(POSE_RAW, last)
         until(lambda: (next(frames), source._received.total())[1] == 2)
     assert source.status()["dropped.lost pose/raw"] == "3"
-    frames.close()
 
 
 @pytest.mark.parametrize(
@@ -372,13 +377,7 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path) -> None:
 def test_a_camera_that_is_not_merged_is_a_problem(
     folder: Path, clock: VirtualClock, change: Callable[[PoseRaw], PoseRaw], cause: str, words: str
 ) -> None:
-    addresses = [f"ipc://{folder}/{name}" for name in PLACES]
-    source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
-    frames = source.frames()
-    with Publisher(addresses[0]) as left, Publisher(addresses[1]) as right:
-        assert next(frames) is None
-        for publisher in (left, right):
-            assert publisher.wait_for_subscribers({"merge"}, timeout_s=20)
+    with merging(folder, clock) as (source, frames, (left, right)):
         for index, views in enumerate(zip(filmed("left", range(0)), filmed("right", range(0)), strict=True), start=1):
             left.publish(POSE_RAW, views[0])
             right.publish(POSE_RAW, change(views[1]))
@@ -388,7 +387,6 @@ def test_a_camera_that_is_not_merged_is_a_problem(
         assert problem.cause == cause
         assert words in problem.text
         assert not source.problems(), "until it happens again"
-    frames.close()
 
 
 @pytest.mark.parametrize("cameras", ["[]", '["tcp://127.0.0.1:7111"]', '["ipc:///a", "ipc:///a"]'])

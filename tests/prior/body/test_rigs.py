@@ -38,24 +38,32 @@ class Family:
         sides: what the left and the right are called.
     """
 
-    middle: Sequence[tuple[str, float]]
+    middle: str
     legs_on: str
     arms_on: str
-    leg: Sequence[str]
-    arm: Sequence[str]
-    sides: tuple[str, str] = ("Left", "Right")
+    leg: str
+    arm: str
+    sides: str = "Left Right"
     unit: float = 0.01
     up: str = "y"
 
+    @property
+    def heights(self) -> dict[str, float]:
+        """Of the middle, metres above the hips."""
+        parts = (part.rpartition(":") for part in self.middle.split())
+        return {name: float(height) / 100 for name, _, height in parts}
+
     def joints(self) -> list[Joint]:
         """In the file's unit and axes, parents first."""
-        names = [name for name, _ in self.middle]
+        names = [None, *self.heights]
         joints = [
-            Joint(name, names[max(k - 1, 0)] if k else None, self._placed((0.0, height / 100, 0.0)))
-            for k, (name, height) in enumerate(self.middle)
+            Joint(name, above, self._placed((0.0, height, 0.0)))
+            for above, (name, height) in zip(names, self.heights.items(), strict=False)
         ]
-        for side, sign in zip(self.sides, (1, -1), strict=True):
-            for trunk, limb, points in ((self.legs_on, self.leg, LEG), (self.arms_on, self.arm, ARM)):
+        for side, sign in zip(self.sides.split(), (1, -1), strict=True):
+            for trunk, limb, points in (
+                (self.legs_on, self.leg.split(), LEG), (self.arms_on, self.arm.split(), ARM)
+            ):  # fmt: skip
                 parent = trunk
                 for name, (x, y, z) in zip(limb, points.values(), strict=False):
                     joints.append(Joint(name.format(side), parent, self._placed((sign * x, y, z))))
@@ -71,79 +79,67 @@ class Family:
 
 
 USUAL_LEG, USUAL_ARM = "{}UpLeg {}Leg {}Foot {}ToeBase", "{}Shoulder {}Arm {}ForeArm {}Hand"
-
-
-def family(
-    middle: str, legs_on: str, arms_on: str, leg: str, arm: str, *, sides: str = "Left Right", unit: float = 0.01,
-    up: str = "y",
-) -> Family:  # fmt: skip
-    """From names with a blank between them; those of the middle with their heights."""
-    heights = [(name, float(height)) for name, _, height in (part.rpartition(":") for part in middle.split())]
-    left, right = sides.split()
-    return Family(heights, legs_on, arms_on, leg.split(), arm.split(), (left, right), unit, up)
-
-
 FAMILIES = {
-    "Mixamo": family(
+    "Mixamo": Family(
         "mixamorig:Hips:5 mixamorig:Spine:15 mixamorig:Spine1:27 "
         "mixamorig:Spine2:40 mixamorig:Neck:56 mixamorig:Head:66 mixamorig:HeadTop_End:85",
         "mixamorig:Hips", "mixamorig:Spine2",
         "mixamorig:{}UpLeg mixamorig:{}Leg mixamorig:{}Foot mixamorig:{}ToeBase",
         "mixamorig:{}Shoulder mixamorig:{}Arm mixamorig:{}ForeArm mixamorig:{}Hand",
     ),
-    "LAFAN1": family(
+    "LAFAN1": Family(
         "Hips:1 Spine:8 Spine1:20 Spine2:32 Neck:58 Head:69",
         "Hips", "Spine2", "{}UpLeg {}Leg {}Foot {}Toe", USUAL_ARM,
     ),
-    "DanceDB": family(
+    "DanceDB": Family(
         "Hips:2 Spine:9 Spine1:16 Spine2:28 Spine3:43 Spine4:54 Neck:58 Head:66",
         "Hips", "Spine4", USUAL_LEG, USUAL_ARM,
     ),
-    "Xsens": family(
+    "Xsens": Family(
         "Hips:9 Chest:18 Chest2:28 Chest3:38 Chest4:48 Neck:58 Head:67",
         "Hips", "Chest4", "{}Hip {}Knee {}Ankle {}Toe", "{}Collar {}Shoulder {}Elbow {}Wrist",
     ),
-    "Rokoko": family(
+    "Rokoko": Family(
         "Hips:4 Spine1:14 Spine2:24 Spine3:34 Spine4:45 Neck:56 Head:66",
         "Hips", "Spine4", "{}Thigh {}Shin {}Foot {}Toe", USUAL_ARM,
     ),
-    "OptiTrack": family(
+    "OptiTrack": Family(
         "Hip:8 Ab:16 Chest:36 Neck:57 Head:68",
         "Hip", "Chest", "{}Thigh {}Shin {}Foot {}Toe", "{}Shoulder {}UArm {}FArm {}Hand", sides="L R", unit=1.0,
     ),
-    "Perception Neuron": family(
+    "Perception Neuron": Family(
         "Hips:6 Spine:16 Spine1:27 Spine2:42 Neck:57 Neck1:62 Head:67",
         "Hips", "Spine2", "{}UpLeg {}Leg {}Foot", USUAL_ARM,
     ),
-    "SOMA": family(
+    "SOMA": Family(
         "Root:8 Hips:8 Spine1:18 Spine2:28 Chest:38 Neck1:56 Neck2:61 Head:67 HeadEnd:85",
         "Hips", "Chest", "{}Leg {}Shin {}Foot {}ToeBase", USUAL_ARM,
     ),
-    "Bandai": family(
+    "Bandai": Family(
         "joint_Root:2 Hips:2 Spine:20 Chest:32 Neck:56 Head:66",
         "Hips", "Chest", "UpperLeg_{} LowerLeg_{} Foot_{} Toes_{}", "Shoulder_{} UpperArm_{} LowerArm_{} Hand_{}",
         sides="L R",
     ),
-    "ReActIdle (Blender)": family(
+    "ReActIdle (Blender)": Family(
         "pelvis:2 spine.001:24 neck:52 face:70",
         "pelvis", "spine.001", "thigh.{} shin.{} foot.{}", "shoulder.{} upper_arm.{} forearm.{} hand.{}", sides="L R",
         unit=1.0, up="z",
     ),
-    "DAZ": family(
+    "DAZ": Family(
         "hip:-2.6 abdomen:18 chest:31 neck:57 head:66",
         "hip", "chest", "{}Thigh {}Shin {}Foot", "{}Collar {}Shldr {}ForeArm {}Hand", sides="l r",
     ),
-    "iClone": family(
+    "iClone": Family(
         "CC_Base_Hip:2 CC_Base_Waist:10 CC_Base_Spine01:15 CC_Base_Spine02:30 CC_Base_NeckTwist01:57 CC_Base_Head:66",
         "CC_Base_Hip", "CC_Base_Spine02", "CC_Base_{}_Thigh CC_Base_{}_Calf CC_Base_{}_Foot CC_Base_{}_ToeBase",
         "CC_Base_{}_Clavicle CC_Base_{}_Upperarm CC_Base_{}_Forearm CC_Base_{}_Hand", sides="L R",
     ),
-    "Unreal": family(
+    "Unreal": Family(
         "pelvis:8 spine_01:18 spine_02:30 spine_03:42 neck_01:57 head:67",
         "pelvis", "spine_03", "thigh_{} calf_{} foot_{} ball_{}", "clavicle_{} upperarm_{} lowerarm_{} hand_{}",
         sides="l r", up="z",
     ),
-    "mocopi": family(
+    "mocopi": Family(
         "root:4 torso_1:11 torso_2:18 torso_3:25 torso_4:32 "
         "torso_5:39 torso_6:46 torso_7:53 neck_1:57 neck_2:61 head:66",
         "root", "torso_7", "{}_up_leg {}_low_leg {}_foot {}_toes", "{}_shoulder {}_up_arm {}_low_arm {}_hand",
@@ -171,7 +167,7 @@ def test_a_family_is_read_without_a_word(family: Family) -> None:
     np.testing.assert_allclose(heights, rest[[J[name] for name in middle]], atol=0.045)
     assert (np.diff(heights) > 0).all()
     # In the world, too: on its feet, where the file has it.
-    assert body[-1, J["left_hip"], 2] == pytest.approx(HIPS_HEIGHT - family.middle[0][1] / 100, abs=1e-3)
+    assert body[-1, J["left_hip"], 2] == pytest.approx(HIPS_HEIGHT - next(iter(family.heights.values())), abs=1e-3)
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES.keys())
