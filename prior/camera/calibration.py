@@ -299,7 +299,7 @@ def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
     return np.column_stack([rays * z[:, None], z])
 
 
-def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
+def floor_pose(points: Floats, up: Floats) -> tuple[Pose, float]:
     """Estimate the extrinsics of a camera that sees the floor, and the share of points on it. It is above the world's
     origin and looks along +y.
 
@@ -310,29 +310,24 @@ def floor_pose(points: Floats, up: Floats, seed: int = 0) -> tuple[Pose, float]:
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         raise CalibrationError(f"expected a depth image with 100 points or more, got {len(points)}")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     sample = points[rng.choice(len(points), min(len(points), 4000), replace=False)]
-    best: tuple[int, Floats, float] | None = None
-    for a, b, c in sample[rng.integers(len(sample), size=(1000, 3))]:
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-6:
-            continue
-        normal *= np.sign(normal @ up) / length
-        if normal @ up < np.cos(FLOOR_TILT):
-            continue
-        height = float(normal @ a)
-        count = int((np.abs(sample @ normal - height) < FLOOR_SLACK).sum())
-        # a table is a plane too: if points lie below a plane, it is not the floor
-        under = int((sample @ normal < height - 3 * FLOOR_SLACK).sum())
-        if under < 0.3 * count and (best is None or count > best[0]):
-            best = count, normal, height
-    if best is None or best[0] < FLOOR_SHARE * len(sample):
+    a, b, c = sample[rng.integers(len(sample), size=(1000, 3))].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    normals *= (np.sign(normals @ up) / np.maximum(length, 1e-6))[:, None]
+    level = (length >= 1e-6) & (normals @ up >= np.cos(FLOOR_TILT))
+    normals, heights = normals[level], (normals[level] * a[level]).sum(axis=1)
+    off = sample @ normals.T - heights
+    counts = (np.abs(off) < FLOOR_SLACK).sum(axis=0)
+    # a table is a plane too: if points lie below a plane, it is not the floor
+    counts[(off < -3 * FLOOR_SLACK).sum(axis=0) >= 0.3 * counts] = 0
+    if not counts.any() or counts.max() < FLOOR_SHARE * len(sample):
         raise CalibrationError(
             f"expected {FLOOR_SHARE:.0%} of what the camera sees to be floor, level to {np.degrees(FLOOR_TILT):.0f} "
             "degrees; turn the camera down, clear the floor, or use the board"
         )
-    _, normal, height = best
+    normal, height = normals[counts.argmax()], heights[counts.argmax()]
     for slack in (2 * FLOOR_SLACK, FLOOR_SLACK):
         on_floor = points[np.abs(points @ normal - height) < slack]
         middle = on_floor.mean(axis=0)
