@@ -37,10 +37,10 @@ class _LoopCache(NullCache):
             return None
         return CompileResult._rebuild(target_context, *payload)
 
-    def save_overload(self, sig: Any, data: Any) -> None:
-        if not data.library.has_dynamic_globals:  # such code contains addresses of this process
-            key = self._key(sig, data.codegen)
-            *parts, environments = data._reduce()
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        if not cres.library.has_dynamic_globals:  # such code contains addresses of this process
+            key = self._key(sig, cres.codegen)
+            *parts, environments = cres._reduce()
             kept = (*parts, tuple(map(_without_globals, environments)))
             loop_cache.save(self._name(key), dumps((key, kept)))
 

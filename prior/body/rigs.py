@@ -144,7 +144,7 @@ class _Spine(NamedTuple):
     head: int
 
 
-def recognise(tree: Tree, name: str = "file") -> Rig:
+def recognise(tree: Tree) -> Rig:
     """Recognise the rig of a file's skeleton (see the module). A skeleton with the canonical names is used as it is.
 
     Raises:
@@ -156,7 +156,7 @@ def recognise(tree: Tree, name: str = "file") -> Rig:
     scale = float(spine.heights[[spine.neck, spine.head]].sum() / _ABOVE_HIPS[[J["neck"], J["head"]]].sum())
     metres = _metres(sum(tree.length(j) for j in legs.joints[1:]) + scale * float(_ABOVE_HIPS[J["neck"]]))
     if set(JOINTS) <= set(tree.joints):
-        return Rig(Skeleton(name, JOINTS, {joint: joint for joint in JOINTS}), metres)
+        return Rig(Skeleton("file", JOINTS, {joint: joint for joint in JOINTS}), metres)
     middle = {joint: _on_spine(spine, scale * float(_ABOVE_HIPS[J[joint]])) for joint in _MIDDLE}
     parts = zip(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"), legs.joints + arms.joints, strict=True)
     left: dict[str, str | Mixture] = {part: tree.joints[j] for part, j in parts}
@@ -164,7 +164,7 @@ def recognise(tree: Tree, name: str = "file") -> Rig:
     toes = [j for j, parent in enumerate(tree.parents) if parent == legs.joints[-1] and tree.length(j) > 0]
     if toes:
         left["foot"] = tree.joints[max(toes, key=tree.length)]
-    return Rig(skeleton(name, middle, left, lambda joint: pairs.get(joint, joint)), metres)
+    return Rig(skeleton("file", middle, left, lambda joint: pairs.get(joint, joint)), metres)
 
 
 def up_axis(bodies: Floats) -> str:

@@ -38,13 +38,11 @@ class PartsCompleter:
         WeightsError: the weights have no completion network.
     """
 
-    def __init__(self, completer: LiveCompleter, weights: str = "default") -> None:
-        arrays, config = load_weights(weights, "hgvae")
+    def __init__(self, completer: LiveCompleter) -> None:
+        arrays, config = load_weights("default", "hgvae")
         sizes = HGVAEConfig.from_dict(config)
         if sizes.completion is None:
-            raise WeightsError(
-                f"weights '{weights}' of hgvae: expected some with a completion network, these have none"
-            )
+            raise WeightsError("weights 'default' of hgvae: expected some with a completion network, these have none")
         self._completer, self._frames = completer, sizes.frames
         self._completion = LiveCompletion(sizes.completion, part(arrays, "completion"), 1)
         self._mean = arrays["mean"].astype(np.float64)[:, None]

@@ -47,7 +47,6 @@ STILL_M, MOVING_M = 1e-3, 0.03
 """Largest extent of a root's motion, and least extent of another joint's, of root-relative coordinates, metres."""
 
 _FEET = slice(2, 6)
-_EDGES = ((np.max, 1.0), (np.min, -1.0))
 
 
 class CompletionError(ValueError):
@@ -288,9 +287,8 @@ def is_root_centred(positions: Floats) -> bool:
     known = finite_joints(positions)
     if known[:, 0].sum() < FPS // 3:
         return False
-    most, least = (edge(np.where(known[..., None], positions, -sign * np.inf), axis=0) for edge, sign in _EDGES)
-    ever = np.asarray(known.any(axis=0))
-    spread = np.where(ever[:, None], most - least, 0.0).max(axis=-1)
+    shown = np.where(known[..., None], positions, np.nan)
+    spread = np.nan_to_num(np.fmax.reduce(shown) - np.fmin.reduce(shown)).max(axis=-1)
     return bool(spread[0] < STILL_M and spread[1:].max() > MOVING_M)
 
 

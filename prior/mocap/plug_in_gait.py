@@ -21,7 +21,7 @@ the markers around them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,8 +178,7 @@ def calibrate(recordings: Iterable[Markers]) -> Calibration:
     left_hip, right_hip, _ = _hips(joined, measured)
     left_shoulder, right_shoulder = _shoulders(joined, measured)
     upper = {"left_knee": left_hip, "right_knee": right_hip, "left_elbow": left_shoulder, "right_elbow": right_shoulder}
-    axis = {joint: _bend_axis(joint, upper[joint], joined) for joint in _HINGES}
-    return Calibration(measured.pelvis_width, measured.pelvis_depth, measured.acromia, axis)
+    return replace(measured, axis={joint: _bend_axis(joint, upper[joint], joined) for joint in _HINGES})
 
 
 def _bend_axis(joint: str, upper: Array, m: Markers) -> float:

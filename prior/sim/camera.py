@@ -216,7 +216,7 @@ def _track(
     truth = on_body.positions(person.positions, person.orientations, stature(person.offsets) / REST_HEIGHT)
     view = sight(truth, people, eye)
     hidden = as_tracked(view.hidden, on_body)
-    points = _exchanged(truth, on_body, swapped(dt, (), rng, _swap_rate_factor(person, eye)))
+    points = _exchanged(truth, on_body, swapped(dt, rng, _swap_rate_factor(person, eye)))
 
     reach = np.linalg.norm(points - eye, axis=-1)
     drawn = draw_errors(travelled(person.positions), dt, rng, noise)

@@ -239,22 +239,21 @@ def travelled(positions: Floats) -> Floats:
     return np.concatenate([step[..., :1, :], step], axis=-2) if step.shape[-2] else np.zeros(positions.shape[:-1])
 
 
-def swapped(
-    dt: Floats, batch: tuple[int, ...], rng: np.random.Generator, rate_factor: Floats | float = 1.0
-) -> dict[str, NDArray[np.bool_]]:
-    """Return when left and right are exchanged, (T, *batch) for each of `SWAP_GROUPS`.
+def swapped(dt: Floats, rng: np.random.Generator, rate_factor: Floats | float) -> dict[str, NDArray[np.bool_]]:
+    """Return when left and right are exchanged, (T,) for each of `SWAP_GROUPS`.
 
-    ``rate_factor`` (T, *batch) multiplies `SWAP_RATE`, for a body seen from its side.
+    ``rate_factor`` (T,) multiplies `SWAP_RATE`, for a body seen from its side.
     """
     result: dict[str, NDArray[np.bool_]] = {}
     for group in SWAP_GROUPS:
-        rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(rate_factor), (len(dt), *batch))
-        active = np.empty((len(dt), *batch), dtype=bool)
-        on = rng.random(batch) < rate[0] * SWAP_DURATION
+        rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(rate_factor), dt.shape)
+        active = np.empty(dt.shape, dtype=bool)
+        on = rng.random() < rate[0] * SWAP_DURATION
         for t in range(len(dt)):
-            ends = rng.random(batch) < 1 - np.exp(-dt[t] / SWAP_DURATION)
-            begins = rng.random(batch) < 1 - np.exp(-rate[t] * dt[t])
-            on = np.where(on, ~ends, begins) if t else on
+            ends = rng.random() < 1 - np.exp(-dt[t] / SWAP_DURATION)
+            begins = rng.random() < 1 - np.exp(-rate[t] * dt[t])
+            if t:
+                on = not ends if on else begins
             active[t] = on
         result[group] = active
     return result

@@ -244,7 +244,7 @@ def test_noise_has_heavy_tails_and_memory_and_confidence_is_informative() -> Non
 
 
 def test_swaps_last_a_moment() -> None:
-    when = swapped(np.full(900, 1 / 30), (), np.random.default_rng(1), rate_factor=20.0)
+    when = swapped(np.full(900, 1 / 30), np.random.default_rng(1), rate_factor=20.0)
     assert when.keys() == SWAP_GROUPS.keys()
     assert all(0 < active.mean() < 0.3 for active in when.values())
 
