@@ -219,15 +219,21 @@ class RawBody(_Record):
 
 
 @dataclass(slots=True, eq=False, repr=False)
-class PoseRaw(_Record):
-    """`pose/raw`: the bodies that a skeleton source observed at one time."""
+class _Stamped(_Record):
+    """The first fields of what is published about a source's bodies."""
 
     stamp_ns: Stamp
-    """capture time, nanoseconds, 0 or later"""
+    """capture time, nanoseconds, 0 or later; of `pose/events`, that of the `pose/world` they were computed from"""
     frame_id: Text
-    """the frame of the positions"""
+    """the frame of the positions; in the world, its name"""
     source: Text
     """the camera or recording, by name"""
+
+
+@dataclass(slots=True, eq=False, repr=False)
+class PoseRaw(_Stamped):
+    """`pose/raw`: the bodies that a skeleton source observed at one time."""
+
     skeleton: Text
     """name of the joint layout: `smpl22`, `coco17`, `kinect22`, …"""
     sensor_pose: Pose
@@ -270,15 +276,9 @@ class CleanBody(_Record):
 
 
 @dataclass(slots=True, eq=False, repr=False)
-class PoseClean(_Record):
+class PoseClean(_Stamped):
     """`pose/clean`: the bodies at one time, refined and completed, in the sensor's frame."""
 
-    stamp_ns: Stamp
-    """capture time of the poses, nanoseconds"""
-    frame_id: Text
-    """the frame of the positions, as in `pose/raw`"""
-    source: Text
-    """the camera or recording, by name"""
     sensor_pose: Pose
     """pose of `frame_id` in the world, as in `pose/raw`"""
     calibrated: bool
@@ -319,15 +319,9 @@ class WorldBody(_Record):
 
 
 @dataclass(slots=True, eq=False, repr=False)
-class PoseWorld(_Record):
+class PoseWorld(_Stamped):
     """`pose/world`: the bodies at one time, in the world. `pose/truth` has the same form."""
 
-    stamp_ns: Stamp
-    """capture time of the poses, nanoseconds"""
-    frame_id: Text
-    """the world's name"""
-    source: Text
-    """the camera or recording, by name"""
     ground_plane: Annotated[_Array, Array(np.float64, (4,))]
     """(4,) a, b, c, d with ax + by + cz + d = 0; the unit normal (a, b, c) points up, d in metres"""
     bodies: Annotated[list[WorldBody], ListOf(WorldBody)]
@@ -354,15 +348,9 @@ class Event(_Record):
 
 
 @dataclass(slots=True, eq=False, repr=False)
-class PoseEvents(_Record):
+class PoseEvents(_Stamped):
     """`pose/events`: all events that begin, hold or end at one time. Sent once a second and when one begins or ends."""
 
-    stamp_ns: Stamp
-    """stamp of the `pose/world` that the events were computed from, nanoseconds"""
-    frame_id: Text
-    """the world's name"""
-    source: Text
-    """the camera or recording, by name"""
     events: Annotated[list[Event], ListOf(Event)]
     end_of_stream: bool = False
     """whether the stream ends here; sent once, without events"""
