@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from steadypose.msgs.codec import MAX_BODIES
 from steadypose.msgs.topics import POSE_CLEAN, POSE_WORLD
-from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, PoseWorld, RawBody
+from steadypose.msgs.types import JOINTS, Message, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.checks.layout import axes_hint, check_sensor_pose, skeleton_hint
 from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.loops import compile_missing
@@ -186,21 +186,17 @@ class Filter:
         poses, of_call = [], []
         for clean in cleaned:
             worlds = self._trajectory.process(clean)
-            events = self._events(clean, worlds)
-            of_call += events or ()
+            events: list[TimedEvent] | None = None
+            if (detector := self._frame_events) is not None:
+                place, known = clean.sensor_pose.position, clean.calibrated
+                events = [event for world in worlds for event in detector.update(world, place, calibrated=known)]
+                of_call += events
             if clean.bodies:
                 self._recognised = True
                 answers: list[tuple[str, Message]] = [(POSE_CLEAN, clean), *((POSE_WORLD, world) for world in worlds)]
                 poses.append(Poses(self._arrays(NpzCollector(answers).newest), self.problems, events=events))
         self.events = tuple(of_call)
         return poses
-
-    def _events(self, clean: PoseClean, worlds: Sequence[PoseWorld]) -> list[TimedEvent] | None:
-        """The events of a frame; None if nobody looks for them."""
-        if self._frame_events is None:
-            return None
-        sensor, calibrated = clean.sensor_pose.position, clean.calibrated
-        return [event for world in worlds for event in self._frame_events.update(world, sensor, calibrated=calibrated)]
 
     def _arrays(self, rows: dict[int, NDArray[np.void]]) -> dict[str, NDArray[Any]]:
         """The arrays of `NpzCollector` for a single frame; without an axis of bodies, of the first."""

@@ -83,7 +83,11 @@ class Poses(dict[str, NDArray[Any]]):
     Attributes:
         problems: probable faults of the input, as text, with the remedy.
         refused: counts of unused frames, bodies and joints, by cause.
+        events: what the people do. Of `clean`, each event once, by begin; of a `Filter`, what begins, holds or ends
+            now. AttributeError if nobody looked for events.
     """
+
+    events: tuple[TimedEvent, ...]
 
     def __init__(
         self,
@@ -93,7 +97,8 @@ class Poses(dict[str, NDArray[Any]]):
         events: Iterable[TimedEvent] | None = None,
     ) -> None:
         super().__init__(arrays)
-        self._events = None if events is None else tuple(events)
+        if events is not None:
+            self.events = tuple(events)
         self.problems: tuple[str, ...] = tuple(problems)
         self.refused: dict[str, int] = dict(refused or {})
 
@@ -162,17 +167,6 @@ class Poses(dict[str, NDArray[Any]]):
         return self["root_velocity"]
 
     @property
-    def events(self) -> tuple[TimedEvent, ...]:
-        """What the people do. Of `clean`, each event once, by begin; of a `Filter`, what begins, holds or ends now.
-
-        Raises:
-            AttributeError: nobody looked for events.
-        """
-        if self._events is None:
-            raise AttributeError(NO_EVENTS)
-        return self._events
-
-    @property
     def body_id(self) -> NDArray[np.int32]:
         """(B,) ids of the bodies; only 0 if the input has no axis of bodies."""
         return self.get("body_id", np.zeros(1, np.int32))
@@ -188,8 +182,9 @@ class Poses(dict[str, NDArray[Any]]):
         bodies = {}
         for row, id in enumerate(self["body_id"].tolist()):
             arrays = common | {name: self[name].take(row, axis) for name in own}
-            events = None if self._events is None else (event for event in self._events if event.body == id)
-            bodies[id] = Poses(arrays, self.problems, self.refused, events)
+            bodies[id] = Poses(arrays, self.problems, self.refused)
+            if "events" in vars(self):
+                bodies[id].events = tuple(event for event in self.events if event.body == id)
         return bodies
 
     def to_dict(self) -> dict[str, NDArray[Any]]:
@@ -241,8 +236,10 @@ class Poses(dict[str, NDArray[Any]]):
     if not TYPE_CHECKING:  # so that type checkers still find a wrong name
 
         def __getattr__(self, name: str) -> Any:
-            if name == "events":  # Python also asks here for a property that raised AttributeError
-                raise AttributeError(NO_EVENTS)
+            if name == "events":
+                raise AttributeError(
+                    "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
+                )
             raise AttributeError(f"Poses has no attribute {name!r}{nearest(name, dir(self))}")
 
         def __missing__(self, name: str) -> Any:
@@ -251,9 +248,6 @@ class Poses(dict[str, NDArray[Any]]):
     def _by_name(self, name: str) -> ByName:
         first, *others = AXES[name]
         return ByName.of(self[name], CONTACTS if first == "contact" else JOINTS, -1 - len(others))
-
-
-NO_EVENTS = "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
 
 
 def _shapes(kind: str, arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -278,10 +272,6 @@ def _installed(name: str) -> Any:
 
 BUNDLED = "walk_turn"
 """Sample of every installation."""
-
-
-class SampleError(ValueError):
-    """Unknown sample. The text lists the samples."""
 
 
 @dataclass(frozen=True)
@@ -316,7 +306,7 @@ def sample(name: str = BUNDLED) -> Sample:
     if name not in streams:
         hint = nearest(name, streams)
         checkout = "" if (PACKAGE.parents[1] / "pyproject.toml").exists() else "; a checkout of steadypose has more"
-        raise SampleError(f"no sample {name!r}{hint}: there are {', '.join(sorted(streams))}{checkout}")
+        raise ValueError(f"no sample {name!r}{hint}: there are {', '.join(sorted(streams))}{checkout}")
     raws: list[PoseRaw] = []
     truths: list[PoseWorld] = []
     for _, message in open_recording(streams[name]):
