@@ -177,11 +177,9 @@ class Manifest:
                 with self.path.open("a", encoding="utf-8") as file:
                     file.write("\n")
             for line in text.splitlines():
-                try:
+                with suppress(ValueError):  # of the line that was cut short
                     entry = json.loads(line)
                     self._known[entry["input"]] = entry
-                except (ValueError, KeyError, TypeError, RecursionError):
-                    continue
         elif out.exists() and any(out.iterdir()):
             raise LaunchError(f"{out}: expected a new folder, or one with the {MANIFEST} of an earlier call")
         out.mkdir(exist_ok=True)

@@ -24,6 +24,7 @@ from steadypose.nodes.commands.calibrate_files import (
     write_image,
 )
 from steadypose.nodes.commands.calibrate_sensor import CalibrateSensor
+from steadypose.nodes.commands.output import File
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
     MIN_CORNERS,
@@ -43,7 +44,6 @@ GOOD_SIGMA_M = 0.005
 DPI = 300
 LaunchFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
 Images = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE ...")]
-FloorPicture = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 _MARGIN_MM = 8.0
 _INCH_MM = 25.4
 
@@ -171,7 +171,7 @@ class CalibratePose(_OfBoard):
         picture: image to write, with the floor's grid drawn over it. Default: beside the launch file.
     """
 
-    picture: FloorPicture = None
+    picture: File = None
 
     def run(self) -> None:
         lens = lens_of(self.launch)
@@ -220,7 +220,7 @@ class CalibrateFloor:
     launch: LaunchFile
     depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    picture: FloorPicture = None
+    picture: File = None
 
     def run(self) -> None:
         lens = lens_of(self.launch)

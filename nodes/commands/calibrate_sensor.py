@@ -13,14 +13,16 @@ import tyro
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import PoseRaw
+from steadypose.nodes.checks.problem import observed
 from steadypose.nodes.commands.batch import FILES, find_recordings, is_folder_of_recordings
 from steadypose.nodes.commands.output import check_output, plural
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.sinks.drawing import to_world
 from steadypose.nodes.sources.npz import read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.kinematics import rigid_alignment, rotation_matrix
+from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.stream import interpolated
@@ -127,9 +129,9 @@ def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
 
     common_s = 0.0
     for observed_at, truth_at in _pairs(recording, reference):
-        observed, truth = _joints(observed_at), _joints(truth_at)
-        first = max(observed.stamps_ns[0], truth.stamps_ns[0])
-        last = min(observed.stamps_ns[-1], truth.stamps_ns[-1])
+        sensor, truth = _joints(observed_at), _joints(truth_at)
+        first = max(sensor.stamps_ns[0], truth.stamps_ns[0])
+        last = min(sensor.stamps_ns[-1], truth.stamps_ns[-1])
         if last <= first:
             raise LaunchError(
                 f"{observed_at} and {truth_at}: expected stamps of one clock, but they have no time in common; where "
@@ -137,7 +139,7 @@ def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
             )
         ticks = np.arange(first, last, 1e9 / FPS).astype(np.int64)
         common_s += (last - first) * 1e-9
-        take = SensorTake(_person(observed_at, recording), _at(observed, ticks), observed.camera, _at(truth, ticks))
+        take = SensorTake(_person(observed_at, recording), _at(sensor, ticks), sensor.camera, _at(truth, ticks))
         _check_match(take, f"{observed_at} and {truth_at}")
         yield take
     if common_s < SHORTEST_S:
@@ -210,13 +212,12 @@ def _joints(path: Path) -> _Joints:
             continue
         if len(raw.bodies) > 1:
             raise LaunchError(f"{path}: expected one person, got {len(raw.bodies)} in a frame; cut the others out")
-        body, turn = raw.bodies[0], rotation_matrix(raw.sensor_pose.orientation)
-        observed = np.where((body.confidence > 0)[:, None], body.positions, np.nan).astype(np.float64)
-        joints, _ = to_canonical(SKELETONS[raw.skeleton], observed, body.confidence)
+        body = raw.bodies[0]
+        joints, _ = to_canonical(SKELETONS[raw.skeleton], observed(body), body.confidence)
         if finite_joints(joints).any() and (not stamps or raw.stamp_ns > stamps[-1]):
             camera = np.asarray(raw.sensor_pose.position, np.float64)
             stamps.append(raw.stamp_ns)
-            positions.append(joints @ turn.T + camera)
+            positions.append(to_world(joints, raw.sensor_pose))
     if len(stamps) < 2:
         raise LaunchError(f"{path}: expected a person in two frames or more, got {len(stamps)}")
     return _Joints(np.array(stamps), np.stack(positions), camera)

@@ -149,18 +149,15 @@ def _examine(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
     return found
 
 
-PYTHONS = ((3, 10), (3, 13))
-"""Oldest and newest Python for which all packages of an installation are available."""
 KEY_PACKAGES = ("numpy", "numba", "rosbags", "pyzmq")
 
 
 def check_python() -> Iterator[Finding]:
     running = ".".join(map(str, sys.version_info[:3]))
-    if PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
+    if (3, 10) <= sys.version_info[:2] <= (3, 13):  # for which all packages of an installation are available
         yield Finding("Python", Verdict.GOOD, running)
     else:
-        oldest, newest = (f"{major}.{minor}" for major, minor in PYTHONS)
-        fix = f"install Python {oldest} to {newest}, and reinstall steadypose with it"
+        fix = "install Python 3.10 to 3.13, and reinstall steadypose with it"
         yield Finding("Python", Verdict.BAD, running, fix)
 
 

@@ -61,7 +61,6 @@ UDEV_RULE = (
 )
 
 DEVICES = Path("/dev")
-VIDEO_GROUP = 'sudo usermod -aG video "$USER", then log out and in again'
 
 
 def check_processor() -> Iterator[Finding]:
@@ -114,7 +113,8 @@ def check_webcam() -> Iterator[Finding]:
     cameras = sorted(DEVICES.glob("video*"))
     closed = [camera.name for camera in cameras if not os.access(camera, os.R_OK | os.W_OK)]
     if closed:
-        yield noted("webcams", f"{', '.join(closed)} may not be opened by you", VIDEO_GROUP)
+        fix = 'sudo usermod -aG video "$USER", then log out and in again'
+        yield noted("webcams", f"{', '.join(closed)} may not be opened by you", fix)
     else:
         yield noted("webcams", ", ".join(camera.name for camera in cameras) or "none")
 

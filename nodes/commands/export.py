@@ -99,8 +99,8 @@ ROOT = ("root_x", "root_y", "root_z", "root_qx", "root_qy", "root_qz", "root_qw"
 
 
 def retarget(
-    source: Annotated[Path, tyro.conf.arg(metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
+    source: In,
+    out: Out,
     urdf: File = None,
     links: Annotated[tuple[str, ...], tyro.conf.arg(name="link", metavar="PART=LINK")] = (),
     sole: float = 0.0,

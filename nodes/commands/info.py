@@ -16,6 +16,7 @@ from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw
+from steadypose.nodes.checks.problem import observed
 from steadypose.nodes.commands.inspect import (
     Address,
     LaunchFile,
@@ -179,7 +180,7 @@ def describe_file(path: Path) -> Iterator[str]:
             skeletons.add(message.skeleton)
             for body in message.bodies:
                 # in an output, imputed joints have a confidence of 0
-                if (there := np.isfinite(body.positions).all(axis=-1) & (body.confidence > 0)).any():
+                if (there := np.isfinite(observed(body)[:, 0])).any():
                     ids.add(body.id)
                     seen.append(there.mean())
     rate = Rate(stamps)

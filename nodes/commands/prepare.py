@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from steadypose.nodes.commands.output import File
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.mocap.clip import Clip, MotionError, documented
@@ -28,7 +29,7 @@ def prepare(
     mocap: Annotated[Path, tyro.conf.arg(metavar="IN")],
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("data"),
     speeds: Annotated[tuple[float, ...], tyro.conf.arg(metavar="X")] = (1.0,),
-    rig: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    rig: File = None,
 ) -> None:
     """Convert motion capture to training data: 22 joints at 30 Hz, z up, on a floor, with contacts and splits.
 

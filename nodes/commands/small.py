@@ -9,7 +9,7 @@ import tyro
 
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.security import create_keys
-from steadypose.nodes.commands.output import plural, unfinished
+from steadypose.nodes.commands.output import File, In, Out, plural, unfinished
 from steadypose.nodes.graph.launch import bundled
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
@@ -37,10 +37,7 @@ def keys(directory: Annotated[Path, tyro.conf.arg(metavar="DIR")]) -> None:
     print(f"{directory}/clients/: the keys of those who may listen")
 
 
-def repair(
-    source: Annotated[Path, tyro.conf.arg(name="in", metavar="IN")],
-    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
-) -> int:
+def repair(source: In, out: Out) -> int:
     """Write the readable part of a recording to a new one, with index and metadata, and print what is lost.
 
     Use it for damaged files, and for recordings whose writer was killed, which other programs may not read. Each
@@ -68,7 +65,7 @@ def repair(
 def simulate(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
     stream: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = (),
-    manifest: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    manifest: File = None,
 ) -> None:
     """Simulate recordings of a depth camera, with the ground truth on the topic pose/truth.
 
@@ -98,7 +95,7 @@ def plot(
     recording: Annotated[Path, tyro.conf.arg(metavar="IN")],
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
     body: Annotated[int | None, tyro.conf.arg(metavar="ID")] = None,
-    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+    video: File = None,
     over: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO")] = None,
 ) -> None:
     """Plot a recording as an image or a video.
