@@ -73,17 +73,6 @@ def _is_path(setting: Field[Any], value: str) -> bool:
     return _PATH in setting.metadata or (MODEL in setting.metadata and value.endswith(".safetensors"))
 
 
-def check_addresses(setting: str, addresses: list[str]) -> None:
-    """Check that all addresses are strings.
-
-    Raises:
-        LaunchError: an address is not a string. The text names the setting.
-    """
-    for address in addresses:
-        if not isinstance(address, str):
-            raise LaunchError(f"{setting}: expected addresses such as tcp://192.168.1.21:7111, got {address!r}")
-
-
 def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -> None:
     """Check a host and a port. With ``least`` 0, port 0 is allowed and means any free port.
 

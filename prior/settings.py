@@ -106,9 +106,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def _kind_of_items(cls: type, key: str) -> type | None:
-    """Return the annotated type of the numbers in a list or in a table's values; None if it is not int or float."""
+    """Return the annotated type of a list's items or of a table's values; None if it is not int, float or str."""
     kinds = get_args(get_type_hints(cls)[key])
-    return kinds[-1] if kinds and kinds[-1] in (int, float) else None
+    return kinds[-1] if kinds and kinds[-1] in (int, float, str) else None
 
 
 def _is_of(kind: type, value: object) -> bool:
@@ -119,4 +119,4 @@ def _is_of(kind: type, value: object) -> bool:
 def _check_items(name: str, value: list[Any] | dict[str, Any], kind: type) -> None:
     for item in value.values() if isinstance(value, dict) else value:
         if not _is_of(kind, item) or (isinstance(item, float) and not math.isfinite(item)):
-            raise ValueError(f"{name}: expected each to be a {kind.__name__}, got {item!r}")
+            raise ValueError(f"{name}: expected each to be a {'text' if kind is str else kind.__name__}, got {item!r}")

@@ -66,7 +66,7 @@ class Launch(_EveryLaunch):
         if not self.nodes:
             raise LaunchError(f"nodes: expected one or more of {', '.join(NODES)}, got none")
         for node in self.nodes:
-            if node not in [*NODES]:  # a list, because what a file names may be no text, and not hashable
+            if node not in NODES:
                 raise LaunchError(
                     f"nodes names {node!r}, which is not a node{nearest(node, NODES)}; there are {', '.join(NODES)}"
                 )

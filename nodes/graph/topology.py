@@ -18,7 +18,7 @@ from typing import Any
 
 from steadypose.msgs.security import Keys, load_keys, local_directory, make_private
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.nodes.settings import LaunchError, check_addresses, path_setting
+from steadypose.nodes.settings import LaunchError, path_setting
 from steadypose.prior.settings import nearest
 
 
@@ -224,8 +224,6 @@ class TransportSettings:
     def __post_init__(self) -> None:
         taken: dict[str, str] = {}
         for node, address in self.endpoints.items():
-            if not isinstance(address, str):
-                raise LaunchError(f"[transport.endpoints] {node}: expected an address, got {address!r}")
             if node not in NODES:
                 raise LaunchError(
                     f"[transport.endpoints] names {node!r}, which is not a node{nearest(node, NODES)}; "
@@ -278,6 +276,3 @@ class ServerSettings:
 
     clients: list[str] = field(default_factory=list)
     """addresses of the clients' input nodes (``tcp://192.168.1.21:7101``), which replace a local input node"""
-
-    def __post_init__(self) -> None:
-        check_addresses("[server] clients", self.clients)

@@ -57,7 +57,7 @@ class RecorderSettings:
 
     def __post_init__(self) -> None:
         for topic in self.topics:
-            if topic not in [*TOPICS]:  # a list, because what a file names may be no text, and not hashable
+            if topic not in TOPICS:
                 raise LaunchError(
                     f"[recorder] topics names {topic!r}, which nobody publishes{nearest(topic, TOPICS)}; "
                     f"topics are {', '.join(TOPICS)}"

@@ -20,7 +20,7 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.checks.problem import Problem, check_wire, error, warning
 from steadypose.nodes.graph.clock import POLL_S, Clock
-from steadypose.nodes.settings import LaunchError, check_addresses
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.source import MODEL, LiveSource, OakSettings, SourceContext, WebcamSettings
 
 if TYPE_CHECKING:
@@ -171,9 +171,6 @@ class MergeSettings:
 
     cameras: list[str] = field(default_factory=list)
     """addresses of the cameras' input nodes (``tcp://192.168.1.21:7111``)"""
-
-    def __post_init__(self) -> None:
-        check_addresses("[input.merge] cameras", self.cameras)
 
 
 class MergeSource(LiveSource):

@@ -57,9 +57,6 @@ class WebSettings:
 
     def __post_init__(self) -> None:
         check_host_and_port("web", self.host, self.port, least=0)
-        for name in self.names:
-            if not isinstance(name, str):
-                raise LaunchError(f"[web] names: expected host names such as kiosk.local, got {name!r}")
         if self.token and (len(self.token) < 16 or not all(c.isalnum() or c in "-_" for c in self.token)):
             raise LaunchError(
                 f"[web] token: expected 16 or more letters, digits, - and _, got {len(self.token)} characters; "
