@@ -148,11 +148,7 @@ class Soles:
         unknown, their deviations (4,), the probabilities (4,) that feet stand, and seconds since the last frame, above
         0.
         """
-        for k in np.flatnonzero((stands > 0.0) & np.isfinite(above + sigma)):
-            noise = (sigma[k] ** 2 + UNEVEN**2) * max(MEMORY_S / dt, 1.0) / stands[k]
-            gain = self._variances[k // 2] / (self._variances[k // 2] + noise)
-            self._heights[k // 2] += gain * (above[k] - self._heights[k // 2])
-            self._variances[k // 2] *= 1.0 - gain
+        _learn(self._heights, self._variances, above, sigma, stands, max(MEMORY_S / dt, 1.0))
 
 
 @njit("(f8[:], f8[:], f8[:], f8[:], f8[:], f8[:])", cache=True)
@@ -180,3 +176,14 @@ def _settle(heights, variances, stand, stand_variances, rest, known):
         left[k] += share * (1.0 - share) * moved**2 - share * variances[k] ** 2 / total
         probability[k] = stands / whole
     return means, left, probability
+
+
+@njit("(f8[:], f8[:], f8[:], f8[:], f8[:], f8)", cache=True)
+def _learn(heights, variances, above, sigma, stands, repeats):
+    """Update heights (2,) and variances (2,), in place (see `Soles.learn`)."""
+    for k in range(len(above)):
+        if stands[k] > 0.0 and math.isfinite(above[k] + sigma[k]):
+            noise = (sigma[k] ** 2 + UNEVEN**2) * repeats / stands[k]
+            gain = variances[k // 2] / (variances[k // 2] + noise)
+            heights[k // 2] += gain * (above[k] - heights[k // 2])
+            variances[k // 2] *= 1.0 - gain
