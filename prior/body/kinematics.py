@@ -8,6 +8,7 @@ rotations from positions, and `prior.body.bone_lengths` for a person's bones.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -165,7 +166,7 @@ class SensorFrame(NamedTuple):
     @classmethod
     def of(cls, pose: Pose) -> SensorFrame:
         """Build the frame from a message's pose."""
-        return cls(rotation_matrix(pose.orientation), pose.position)
+        return cls(_rotation(pose.orientation.tobytes()), pose.position)
 
     def levelled(self) -> SensorFrame:
         """The same orientation, with the sensor at the origin."""
@@ -178,6 +179,11 @@ class SensorFrame(NamedTuple):
     def from_world(self, positions: Floats) -> Floats:
         """Transform positions (..., 3) metres from the world to the sensor's frame."""
         return (positions - self.origin) @ self.rotation
+
+
+@lru_cache(maxsize=8)
+def _rotation(quaternion: bytes) -> Floats:
+    return rotation_matrix(np.frombuffer(quaternion))
 
 
 def from_rotation_vectors(vectors: Floats) -> Floats:
