@@ -75,8 +75,7 @@ def complete_source(
     frames: RecordedSource,
     fill: Fill,
     uncertainty: Uncertainty,
-    began: Callable[[int], None] = lambda frames: None,
-    advanced: Callable[[int], None] = lambda frame: None,
+    advanced: Callable[[int, int], None] = lambda frames, total: None,
     seed: int | None = None,
 ) -> CompletedSource:
     """Complete a source. The other arguments are those of `complete_raws`.
@@ -88,7 +87,7 @@ def complete_source(
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
         raise LaunchError(f"{frames.path}: expected frames, but none of {len(frames)} could be read")
-    completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, began, advanced, seed)
+    completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, advanced, seed)
     settings = TrajectorySettings()
     world, answers = TrajectoryPipeline(settings), list[tuple[str, Message]]()
     for message, moved in zip(completion.clean, along_paths(completion, settings.weights), strict=True):

@@ -98,8 +98,7 @@ def complete(
                 open_recording(source, read_toml(rig) if rig else NO_RIG),
                 fill,
                 uncertainty,
-                began=lambda frames: progress.update(bar, total=frames),
-                advanced=lambda frame: progress.update(bar, completed=frame),
+                lambda frames, total: progress.update(bar, completed=frames, total=total),
                 seed=seed,
             )
 

@@ -97,8 +97,7 @@ def complete_raws(
     raws: Sequence[PoseRaw],
     fill: Fill,
     uncertainty: Uncertainty,
-    began: Callable[[int], None] = lambda frames: None,
-    advanced: Callable[[int], None] = lambda frame: None,
+    advanced: Callable[[int, int], None] = lambda frames, total: None,
     seed: int | None = None,
 ) -> Completion:
     """Complete the bodies of a recording.
@@ -108,8 +107,7 @@ def complete_raws(
         raws: its messages, at least one, in any order.
         fill: a completer.
         uncertainty: standard deviations of its output.
-        began: called with the number of frames of all bodies together.
-        advanced: called with the number of finished frames.
+        advanced: called with the numbers of finished frames and of all, of all bodies together.
         seed: if given, an alternative is drawn with it (`samples.draw`).
 
     Raises:
@@ -118,18 +116,18 @@ def complete_raws(
     raws = sorted(raws, key=lambda message: message.stamp_ns)
     anchor_ns = raws[0].stamp_ns
     stretches = _stretches(source, raws, anchor_ns)
-    began(sum(len(stretch.given) for stretch in stretches))
     done: list[tuple[Stretch, Completed]] = []
-    before = 0
+    before, total = 0, sum(len(stretch.given) for stretch in stretches)
+    advanced(before, total)
     random = np.random.default_rng(seed)
     for stretch in stretches:
-        completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k))
+        completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k, total))
         if seed is not None:
             covariance = uncertainty.posture.covariance
             completed = draw(completed, uncertainty.of(stretch.given), stretch.offsets, covariance, random)
         done.append((stretch, completed))
         before += len(stretch.given)
-        advanced(before)
+        advanced(before, total)
     centred = sorted({stretch.body for stretch, _ in done if is_root_centred(stretch.given)})
     return Completion(anchor_ns, done, _clean_messages(raws, done, uncertainty, anchor_ns), centred)
 
@@ -169,7 +167,12 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
 def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns: int) -> list[Stretch]:
     """Resample a body to the grid, divided into parts at long gaps."""
     offsets = estimate_offsets(positions[:: max(len(positions) // 900, 1)])
-    _check_size(body, offsets)
+    size = np.linalg.norm(offsets, axis=-1).sum() / np.linalg.norm(REST_OFFSETS, axis=-1).sum()
+    if not SIZES[0] < size < SIZES[1]:
+        raise CompletionError(
+            f"body {body}: its bones are {size:.3g} times those of an adult: expected metres; convert the positions, "
+            "or see whether the skeleton is the right one"
+        )
     ends = np.flatnonzero(np.diff(stamps) > APART_NS) + 1
     found = []
     for rows in np.split(np.arange(len(stamps)), ends):
@@ -195,15 +198,6 @@ def interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.in
     near = np.abs(stamps[nearest] - ticks) <= PERIOD_NS // 2
     joined = np.where(between[:, None], (1.0 - share) * places[before] + share * places[after], places[nearest])
     return np.where((between | near)[:, None], joined, np.nan)
-
-
-def _check_size(body: int, offsets: Floats) -> None:
-    size = np.linalg.norm(offsets, axis=-1).sum() / np.linalg.norm(REST_OFFSETS, axis=-1).sum()
-    if not SIZES[0] < size < SIZES[1]:
-        raise CompletionError(
-            f"body {body}: its bones are {size:.3g} times those of an adult: expected metres; convert the positions, "
-            "or see whether the skeleton is the right one"
-        )
 
 
 def _clean_messages(

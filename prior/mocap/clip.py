@@ -64,11 +64,6 @@ class Clip:
     """(T, J, 3) metres, z up; NaN where missing"""
 
     @property
-    def person(self) -> str:
-        """The person's name, equal in all files of a source (see `person_of`)."""
-        return person_of(self.source, self.subject)
-
-    @property
     def seconds(self) -> float:
         """Duration, seconds."""
         return len(self.positions) / self.fps

@@ -11,7 +11,7 @@ from tests.prior.body.test_rigs import FAMILIES
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.bvh import CMU_BVH
-from steadypose.prior.mocap.clip import Clip, MotionError
+from steadypose.prior.mocap.clip import Clip, MotionError, person_of
 from steadypose.training.data.cmu import CMU_AMC
 from steadypose.training.data.datasets import DATA_SETS, REPEATS
 from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, members
@@ -143,7 +143,7 @@ def test_dancers_and_actors_are_told_from_the_names_of_files(tmp_path: Path) -> 
     ):
         [clip] = read[name](unpack(tmp_path / name, {file: idle_bvh()}), ignore)
         assert isinstance(clip, Clip)
-        assert [clip.name, clip.person, clip.action] == told
+        assert [clip.name, person_of(clip.source, clip.subject), clip.action] == told
 
 
 @pytest.mark.parametrize(
