@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from steadypose.msgs.types import Message
 from steadypose.nodes.graph.clock import POLL_S
@@ -17,11 +16,6 @@ from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
 from steadypose.prior.clean.settings import PriorSettings
-
-if TYPE_CHECKING:
-    import rerun as rr
-
-    from steadypose.nodes.sinks.viewer.server import ViewerServer
 
 
 @dataclass(frozen=True)
@@ -54,7 +48,7 @@ class ViewerNode(Node):
         asked = self.launch.settings(InputSettings).image
         self._images = ImageReader(self.launch.transport.ipc_directory / NAME) if asked else None
         with ViewerServer(settings.port, settings.host) as self._server:
-            recording = connect(self._server)
+            recording = self._server.connect()
             score = self.launch.settings(PriorSettings).score
             self._view = PoseView(recording, threshold=-math.log10(score.false_alarms))
             print(f"viewer: {self._server.url}", flush=True)
@@ -78,14 +72,3 @@ class ViewerNode(Node):
 
     def status(self) -> dict[str, str]:
         return {"address": self._server.url.partition("?")[0]}  # without the token, because diagnostics are recorded
-
-
-def connect(server: ViewerServer) -> rr.RecordingStream:
-    """Create a stream of drawings to the server."""
-    import rerun as rr
-
-    from steadypose.nodes.sinks.viewer.server import FLUSH_S
-
-    recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
-    server.show(recording)
-    return recording

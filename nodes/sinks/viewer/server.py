@@ -206,10 +206,11 @@ class ViewerServer(Closing):
             self.close()
             raise
 
-    def show(self, recording: rr.RecordingStream) -> None:
-        """Serve everything drawn into a recording from now on."""
+    def connect(self) -> rr.RecordingStream:
+        """A recording; what is drawn into it is served."""
         import rerun as rr
 
+        recording = rr.RecordingStream("steadypose", batcher_config=rr.ChunkBatcherConfig(flush_tick=FLUSH_S))
         stream = rr.binary_stream(recording)
 
         def read() -> None:
@@ -218,6 +219,7 @@ class ViewerServer(Closing):
                     self._drawings.add(piece)
 
         threading.Thread(target=read, daemon=True).start()
+        return recording
 
     def check(self) -> None:
         """Check that Rerun's server is running.

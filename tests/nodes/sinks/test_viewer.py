@@ -22,7 +22,6 @@ from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseRaw, RawBody, Tracking
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings
-from steadypose.nodes.sinks.viewer import node as viewer_node
 from steadypose.nodes.sinks.viewer import scene
 from steadypose.nodes.sinks.viewer import server as viewer_server
 from steadypose.nodes.sinks.viewer.layout import FAINT_RGB, SIDE_RGB
@@ -266,7 +265,7 @@ class Server:
 
 def test_the_node_draws_what_is_published_and_ends_with_its_server(tmp_path: Path, log: Log, monkeypatch) -> None:
     monkeypatch.setattr(viewer_server, "ViewerServer", Server)
-    monkeypatch.setattr(viewer_node, "connect", lambda server: log)
+    monkeypatch.setattr(Server, "connect", lambda self: log, raising=False)
     launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
     node = ViewerNode(launch)
     raised: list[RuntimeError] = []
@@ -313,7 +312,7 @@ def asked(url: str, host: str | None = None) -> int:
 
 
 def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> None:
-    recording = viewer_node.connect(server)
+    recording = server.connect()
     recording.log("a", rr.TextLog("somebody"))
     with urllib.request.urlopen(server.data_url, timeout=20) as answer:
         assert answer.read(3) == b"RRF"

@@ -10,7 +10,6 @@ from tests.helpers.synthetic_poses import messages
 from tests.nodes.sinks.test_viewer import free_port
 
 from steadypose.nodes.sinks.viewer.layout import CONTACT_RGB, SIDE_RGB
-from steadypose.nodes.sinks.viewer.node import connect
 from steadypose.nodes.sinks.viewer.scene import PoseView
 from steadypose.nodes.sinks.viewer.server import ViewerServer
 
@@ -41,7 +40,7 @@ def is_drawn(screenshot: bytes) -> bool:
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; on Debian: apt-get install chromium")
 def test_the_page_draws_three_panels_and_reaches_nobody_but_this_machine() -> None:
     with ViewerServer(free_port()) as server, playwright.sync_playwright() as play:
-        recording = connect(server)
+        recording = server.connect()
         view = PoseView(recording)
         for topic, message in messages(4.0):
             view.log(topic, message)
