@@ -325,23 +325,6 @@ class Still:
     """(3,) direction of up measured by the IMU, optical frame; None without a calibrated IMU"""
 
 
-class Pairs(dai.node.HostNode):
-    """Queues pairs of ``colour`` and ``depth``."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pairs: queue.Queue[tuple[Any, Any]] = queue.Queue(maxsize=2)
-
-    def build(self, pairs: dai.Node.Output) -> "Pairs":
-        """Link the node."""
-        self.link_args(pairs)
-        return self
-
-    def process(self, pair: dai.MessageGroup) -> None:
-        if not self.pairs.full():
-            self.pairs.put((pair["colour"], pair["depth"]))
-
-
 def capture(
     pipeline: dai.Pipeline,
     colour: dai.Node.Output,
@@ -354,17 +337,16 @@ def capture(
     Raises:
         CameraError: no image arrives in time.
     """
-    pairs = pipeline.create(Pairs).build(_pairs(pipeline, colour=colour, depth=depth))
+    pairs = _pairs(pipeline, colour=colour, depth=depth).createOutputQueue(maxSize=2)
     level = GravityEstimator()
     if readings:
         pipeline.create(ImuReader).build(readings[0], level, readings[1])
     pipeline.start()
-    try:
-        for _ in range(settle):
-            pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
-        image, distances = pairs.pairs.get(timeout=PAIR_TIMEOUT_S)
-    except queue.Empty:
-        raise CameraError(f"the camera gave no image with depth within {PAIR_TIMEOUT_S:g} s") from None
+    pair: Any = None
+    for _ in range(settle + 1):
+        if (pair := pairs.get(timedelta(seconds=PAIR_TIMEOUT_S))) is None:
+            raise CameraError(f"the camera gave no image with depth within {PAIR_TIMEOUT_S:g} s")
+    image, distances = pair["colour"], pair["depth"]
     late = time.monotonic() + READING_TIMEOUT_S
     while readings and not level.measured and time.monotonic() < late:
         time.sleep(0.01)
