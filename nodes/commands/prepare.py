@@ -20,8 +20,9 @@ from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.settings import LaunchError
 from steadypose.prior.mocap.clip import Clip, MotionError, documented
 from steadypose.prior.mocap.files import SUFFIXES, describe
+from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import DATA_SETS, SPLITS, DataSet
-from steadypose.training.data.prepare import FPS, Prepared, at_speed, prepare_clip, write_prepared
+from steadypose.training.data.prepare import Prepared, at_speed, prepare_clip, write_prepared
 from steadypose.training.data.readers import UNREADABLE, Dropped, read_own
 
 

@@ -14,16 +14,15 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.body.bone_lengths import estimate_offsets
+from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import REST_SPEED, label_contacts
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
+from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import Split, Use
 from steadypose.training.data.readers import Dropped
 from steadypose.training.files import whole
-
-FPS = 30.0
-"""Frame rate of all training data, frames per second."""
 
 CUTOFF = 12.0
 """Cut-off frequency of the anti-aliasing filter before resampling to 30 Hz, Hz."""
@@ -44,9 +43,6 @@ MAX_BONE_CHANGE = 0.10
 MAX_ACCELERATION = 200.0
 """Largest acceleration (second difference at 30 Hz), m/s². The fastest real motion of these recordings, a kicking foot,
 reaches 195; a joint that jumps by 15 cm and back reaches 270."""
-
-TOE_HEIGHT = 0.015
-"""Height above the floor of the forefoot's joint at rest, metres."""
 
 RAISED = 0.12
 """Height above the floor above which a lower toe that stands still is on something else, metres."""

@@ -16,8 +16,9 @@ from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
-from steadypose.training.data.datasets import DATA_SETS, DataSet, Split
-from steadypose.training.data.prepare import FPS, fill_gaps, find_faults, resample, runs, save_arrays
+from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.datasets import DATA_SETS
+from steadypose.training.data.prepare import fill_gaps, find_faults, resample, runs, save_arrays
 from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
@@ -89,7 +90,7 @@ def write_arrays(mocap: Path, out: Path) -> Path:
             for clip in track(list(data.read(path, lambda _: None)), description=data.name):
                 if not isinstance(clip, Clip):
                     continue
-                split = _split(clip, data)
+                split = data.split(clip)
                 if split in found:
                     found[split] += [(data.name, *one) for one in _at_speeds(clip, SPEEDS)]
     for split, clips in found.items():
@@ -108,17 +109,6 @@ def write_arrays(mocap: Path, out: Path) -> Path:
     # the last: its existence means that all arrays are written
     save_arrays(out / "pairs.npz", **vars(_pairs(mocap / "ui_prmd.npz")))
     return out
-
-
-def _split(clip: Clip, data: DataSet) -> Split:
-    """Return the split of `training.data.datasets`, with two exceptions so that each person is in only one split.
-
-    All clips of CMU's subject 02 are for validation. Clips of unknown subjects, who may be in other splits, are for
-    training.
-    """
-    if data.name == "CMU (AMC)":
-        return "val" if clip.subject == "02" else "train"
-    return "train" if data.name == "CMU (expmap)" else data.split(clip)
 
 
 def load_motion(arrays: Path, split: str) -> Motion:

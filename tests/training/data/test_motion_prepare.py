@@ -14,15 +14,15 @@ from tests.training.data.test_motion_datasets import idle_bvh, pack, unpack
 
 from steadypose.nodes.commands.prepare import find_sources, prepare
 from steadypose.nodes.settings import LaunchError
+from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
+from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.datasets import SPLITS
 from steadypose.training.data.prepare import (
-    FPS,
-    TOE_HEIGHT,
     Prepared,
     fill_gaps,
     find_faults,
