@@ -51,7 +51,7 @@ def pair(subject: str, take: int, corrupted: str) -> KinectPair:
     sway = np.sin(np.linspace(0, 3, FRAMES)[:, None, None] + rng.uniform(0, 6, (22, 3)))
     kinect = STANDING + 0.1 * sway
     vicon = to_canonical(KINECT22, kinect)[0] + rng.normal(0, 0.05, (22, 3))
-    return KinectPair(f"m01_{subject}_e{take:02}", subject, "m01", 30.0, kinect, vicon, np.zeros((FRAMES, 39, 3)))
+    return KinectPair(f"m01_{subject}_e{take:02}", subject, "m01", 30.0, kinect, vicon)
 
 
 def clip(subject: str, take: int, corrupted: str) -> Clip:

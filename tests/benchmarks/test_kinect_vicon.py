@@ -216,9 +216,9 @@ def test_who_is_out_of_step_has_figures_and_is_in_no_mean() -> None:
 
 
 def test_every_nth_clip_of_each_person_is_read(monkeypatch) -> None:
-    rng, shapes = np.random.default_rng(0), ((5, 22, 3), (5, 22, 3), (5, 39, 3))
+    rng = np.random.default_rng(0)
     pairs = [
-        KinectPair(f"{who} {take}", who, "m01", 30.0, *(rng.normal(size=shape) for shape in shapes))
+        KinectPair(f"{who} {take}", who, "m01", 30.0, *rng.normal(size=(2, 5, 22, 3)))
         for who in ("s01", "s02") for take in range(5)
     ]  # fmt: skip
     monkeypatch.setattr(kinect_clips, "load_pairs", lambda path, who: [pair for pair in pairs if pair.subject in who])

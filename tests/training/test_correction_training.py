@@ -40,7 +40,7 @@ def standing(seed: int) -> np.ndarray:
 
 
 def pair(kinect: np.ndarray, vicon: np.ndarray) -> KinectPair:
-    return KinectPair("a", "s01", "m01", 30.0, kinect, vicon, np.zeros((20, 39, 3)))
+    return KinectPair("a", "s01", "m01", 30.0, kinect, vicon)
 
 
 def test_a_kinect_is_moved_to_vicon_by_joints_that_both_have_throughout() -> None:

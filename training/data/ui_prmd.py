@@ -43,8 +43,6 @@ class KinectPair:
     """(T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y"""
     vicon: NDArray[np.float64]
     """(T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost"""
-    markers: NDArray[np.float64]
-    """(T, 39, 3) metres, the Plug-in-Gait markers, z up; NaN where lost"""
 
 
 def _metres(counts: NDArray[np.int16]) -> NDArray[np.float64]:
@@ -66,25 +64,20 @@ def load_pairs(path: Path, subjects: Collection[str]) -> list[KinectPair]:
             raise MotionError(f"{path}: no recordings of {', '.join(sorted(missing))}")
         pairs: list[KinectPair] = []
         for subject, group in groupby((p for p in split if p[0] in subjects), key=lambda pair: pair[0]):
-            recordings = {
-                name: (_metres(archive[f"{name}/kinect"]) @ Y_UP_TO_Z_UP.T, _metres(archive[f"{name}/vicon_markers"]))
+            markers = {
+                name: dict(zip(marker_names, _metres(archive[f"{name}/vicon_markers"]).swapaxes(0, 1), strict=True))
                 for _, name in group
             }
-            named = {
-                name: {m: markers[:, i] for i, m in enumerate(marker_names)}
-                for name, (_, markers) in recordings.items()
-            }
-            calibration = calibrate(named.values())
+            calibration = calibrate(markers.values())
             pairs += [
                 KinectPair(
                     name=name,
                     subject=subject,
                     movement=name.split("_")[0],
                     fps=fps,
-                    kinect=kinect,
-                    vicon=joint_centres(named[name], calibration),
-                    markers=markers,
+                    kinect=_metres(archive[f"{name}/kinect"]) @ Y_UP_TO_Z_UP.T,
+                    vicon=joint_centres(own, calibration),
                 )
-                for name, (kinect, markers) in recordings.items()
+                for name, own in markers.items()
             ]
     return pairs
