@@ -139,17 +139,11 @@ def _smoothed(motion: MotionSet, first: NDArray[np.int64], rng: Rng) -> tuple[ND
     smoother, seen = MixtureSmoother(delay, len(rows)), truth + _errors(truth.shape, rng)
     estimates = [smoother.update(seen[:, t], t / FPS) for t in range(FRAMES)]
     kept = [estimate for estimate in estimates if estimate is not None]
-    positions = np.stack([estimate.positions for estimate in kept], axis=1)
-    sigma = np.stack([estimate.sigma for estimate in kept], axis=1)
-    positions, sigma = (_to_length(values) for values in (positions, sigma))
+    positions, sigma = np.full(truth.shape, np.nan), np.full(truth.shape[:3], np.nan)
+    positions[:, : len(kept)] = np.stack([estimate.positions for estimate in kept], axis=1)
+    sigma[:, : len(kept)] = np.stack([estimate.sigma for estimate in kept], axis=1)
     load, rest = (np.stack([label_contacts(clip, FPS, speed) for clip in truth]) for speed in (LOAD_SPEED, REST_SPEED))
     return positions.astype(np.float32), sigma.astype(np.float32), yaw.astype(np.float32), load, rest
-
-
-def _to_length(values: Floats) -> Floats:
-    """(C, `FRAMES`, ...), NaN after the last frame of (C, T, ...)."""
-    missing = FRAMES - values.shape[1]
-    return np.concatenate([values, np.full((len(values), missing, *values.shape[2:]), np.nan)], axis=1)
 
 
 def _errors(shape: tuple[int, ...], rng: Rng) -> Floats:

@@ -8,7 +8,6 @@ expert, so that no kind of sensor or motion dominates. The standard deviation is
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,18 +136,8 @@ def _length(vectors: Tensor) -> Tensor:
     return (vectors.square().sum(dim=-1) + 1e-4).sqrt()
 
 
-@dataclass(frozen=True)
-class Loss:
-    """The loss of a batch, and its terms for each clip."""
-
-    total: Tensor
-    relative: Tensor
-    own: Errors
-    likelihood: Tensor
-
-
-def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
-    """Compute the loss of clips with one delay."""
+def loss_of(network: MixtureNet, batch: Batch, delay: int) -> tuple[Tensor, Tensor]:
+    """Return the loss of clips with one delay, and the errors of each clip (C,) relative to its best expert's."""
     smooth = float(np.interp(delay, SMOOTH_DELAYS, SMOOTH))
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
@@ -167,8 +156,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> Loss:
     square = torch.where(known[..., None], places - batch.truth, 0.0).square().mean(dim=-1).detach() * 1e6
     density = 0.5 * (variance.log() + square / variance)
     likelihood = (density * known).sum(dim=(1, 2)) / known.sum(dim=(1, 2)).clamp(min=1)
-    total = relative.mean() + DEVIATION * likelihood.mean()
-    return Loss(total, relative, own, likelihood)
+    return relative.mean() + DEVIATION * likelihood.mean(), relative
 
 
 def _measure_features(network: MixtureNet, sensors: Sensors, seed: int) -> None:
@@ -193,14 +181,12 @@ def train_mixture(options: TrainingOptions) -> Path:
     def loss(network: MixtureNet, clips: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         delays = [int(delay) for delay in rng.choice(DELAYS, DELAYS_A_STEP, p=DELAY_SHARES)]
         batches = [(through_bank(sensors.draw(clips, rng), delay), delay) for delay in delays]
-        total = torch.stack([loss_of(network, batch, delay).total for batch, delay in batches]).mean()
+        total = torch.stack([loss_of(network, batch, delay)[0] for batch, delay in batches]).mean()
         recent["loss"] += 0.02 * (total.item() - recent["loss"]) if done else total.item()
         return total, recent
 
     def evaluate(network: MixtureNet) -> dict[str, float]:
-        return {
-            f"val, delay {delay}": loss_of(network, batch, delay).relative.mean().item() for delay, batch in watched
-        }
+        return {f"val, delay {delay}": loss_of(network, batch, delay)[1].mean().item() for delay, batch in watched}
 
     recipe = Recipe(
         "mixture", lambda: MixtureNet(MixtureConfig()), loss, evaluate, ITERATIONS, CLIPS,
