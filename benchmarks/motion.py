@@ -35,7 +35,7 @@ class MotionClips:
     source: dict[str, Any]
     """description for the results file"""
     person: NDArray[np.str_]
-    """(C,) who moves (`benchmarks.intervals` averages over people)"""
+    """(C,) who moves (`benchmarks.scores` averages over people)"""
     data_set: NDArray[np.str_]
     """(C,) data set of each; tables have a column for each, before their mean"""
 

@@ -1,4 +1,9 @@
-"""Scores of a method over clips: one number per clip, means over people with their intervals, and tables."""
+"""Scores of a method over clips: one number per clip, means over people with confidence intervals, and tables.
+
+Clips of one person are alike. An interval over clips would say how well these people are known, not people in general.
+So the mean is that of the people's own means. Its interval comes from drawing people, with all their clips, with
+replacement (cluster bootstrap: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 3.8).
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.metrics import acceleration_error, mean_mm, position_error
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.results import NONE, Table
@@ -48,21 +52,17 @@ def pivot(
         value = record.get(figure)
         cell = "–" if value is None else value if isinstance(value, str) else f"{value:.{digits}f}"
         rows.setdefault((record["method"], record["delay"]), {})[record[column]] = cell
+    run = list(dict.fromkeys(method for method, _ in rows))
     return Table(
         name=name,
         title=title,
         columns=["method", "delay, frames", *columns],
         rows=[
             [method, "offline" if delay < 0 else str(delay), *(cells.get(c, "–") for c in columns)]
-            for (method, delay), cells in sorted(rows.items(), key=lambda item: _order(records, item[0]))
+            for (method, delay), cells in sorted(rows.items(), key=lambda row: (run.index(row[0][0]), row[0][1]))
         ],
         note=note,
     )
-
-
-def _order(records: Sequence[Mapping[str, Any]], row: tuple[str, int]) -> tuple[int, int]:
-    """Order methods as they were run, each by delay."""
-    return list(dict.fromkeys(record["method"] for record in records)).index(row[0]), row[1]
 
 
 def _mean(values: Floats) -> Floats:
@@ -98,3 +98,63 @@ def source_table(
         "brackets, the 95 % interval over people."
     )
     return Table(name, title, ["", *sources, "mean over people", f"of: {baseline}"], rows, note)
+
+
+DRAWS = 4000
+
+
+class Interval(NamedTuple):
+    """A mean over people.
+
+    Attributes:
+        mean: mean of the people's own means; NaN without people.
+        low, high: 95 % interval; NaN for a single person.
+        people: number of people.
+    """
+
+    mean: float
+    low: float
+    high: float
+    people: int
+
+    def text(self, digits: int, scale: float = 1.0) -> str:
+        """Format for a table: the mean, with the interval in brackets if there is one; a dash if there is no mean."""
+        if np.isnan(self.mean):
+            return NONE
+        mean, low, high = (f"{scale * value:.{digits}f}" for value in self[:3])
+        return f"{mean} ({low}–{high})" if np.isfinite(self.low) else mean
+
+
+def people_means(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> NDArray[np.float64]:
+    """Return the mean of each person's clips (P,), in alphabetical order; ``values`` (N,), NaN where a clip has none,
+    and ``people`` (N,) have one entry per clip. People without values are left out.
+    """
+    values, people = np.asarray(values, dtype=np.float64), np.asarray(people)
+    known = np.isfinite(values)
+    _, person = np.unique(people[known], return_inverse=True)
+    return np.bincount(person, values[known]) / np.bincount(person)
+
+
+def interval(values: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> Interval:
+    """Return the mean over people of clips' values (N,), NaN where a clip has none, and its 95 % interval."""
+    return _interval(people_means(values, people))
+
+
+def ratio(values: ArrayLike, baseline: ArrayLike, people: Sequence[str] | NDArray[np.str_]) -> Interval:
+    """Return the ratio of two methods' values (N,), above zero, on the same clips, with its interval: the geometric
+    mean of the people's own ratios. A clip counts if both have a value.
+    """
+    values, baseline = np.asarray(values, dtype=np.float64), np.asarray(baseline, dtype=np.float64)
+    both = np.isfinite(values) & np.isfinite(baseline)
+    own = (people_means(np.where(both, v, np.nan), people) for v in (values, baseline))
+    found = _interval(np.log(np.divide(*own)))
+    return found._replace(mean=float(np.exp(found.mean)), low=float(np.exp(found.low)), high=float(np.exp(found.high)))
+
+
+def _interval(means: NDArray[np.float64]) -> Interval:
+    count = len(means)
+    if count < 2:
+        return Interval(float(means[0]) if count else np.nan, np.nan, np.nan, count)
+    drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
+    low, high = np.quantile(means[drawn].mean(axis=1), (0.025, 0.975))
+    return Interval(float(means.mean()), float(low), float(high), count)

@@ -13,9 +13,9 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
-from steadypose.prior.body.skeleton import BONES_BETWEEN, REST_POSITIONS, J
+from steadypose.prior.body.skeleton import BONES_BETWEEN, HIPS, REST_POSITIONS, SHOULDERS, J
 
-_ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
+_ACROSS = HIPS, SHOULDERS
 
 
 def beside(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
@@ -70,7 +70,6 @@ def _turned(was: Floats, now: Floats) -> Floats:
 RIDGE = 1e-6
 """Regularisation of the variances along each axis, m²: 1 mm, so that joints tied by a bone can be solved for."""
 
-_ACROSS = tuple((J[f"left_{part}"], J[f"right_{part}"]) for part in ("hip", "shoulder"))
 _ROOT = J["pelvis"]
 
 

@@ -11,14 +11,12 @@ one layer of 256 units, as in the other recurrent baseline.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from steadypose.benchmarks.baselines.recurrent import _batch_first, _headings, _turned
-from steadypose.benchmarks.baselines.smoothnet import descend, windows
+from steadypose.benchmarks.baselines.recurrent import BATCH, FRAMES, SCALE, WIDTH, _batch_first, _headings, _turned
+from steadypose.benchmarks.baselines.smoothnet import Track, descend, windows
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
@@ -35,7 +33,7 @@ SAME_LENGTH = 0.01
 
 _LIMBS = [J[f"{side}_{part}"] for part in ("elbow", "wrist", "knee", "ankle", "foot") for side in ("left", "right")]
 _PARENTS = [PARENTS[joint] for joint in _LIMBS]
-_JOINTS, _WIDTH, _SCALE, _BATCH, _FRAMES = len(MIRROR), 256, 5.0, 32, 60
+_JOINTS = len(MIRROR)
 
 
 class MotionModel(nn.Module):
@@ -44,30 +42,28 @@ class MotionModel(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.gru = nn.GRU(6 * _JOINTS, _WIDTH, batch_first=True)
-        self.decode = nn.Linear(_WIDTH, 3 * _JOINTS)
+        self.gru = nn.GRU(6 * _JOINTS, WIDTH, batch_first=True)
+        self.decode = nn.Linear(WIDTH, 3 * _JOINTS)
 
     def forward(self, poses: Tensor, moved: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         turn = _headings(poses)
         about = poses - poses[:, :, J["pelvis"], None]
-        x = _SCALE * torch.cat([about @ turn, 10 * moved @ turn], dim=-1).flatten(2)
+        x = SCALE * torch.cat([about @ turn, 10 * moved @ turn], dim=-1).flatten(2)
         known, state = self.gru(x, state)
-        added = self.decode(known).unflatten(-1, (_JOINTS, 3)) / _SCALE
+        added = self.decode(known).unflatten(-1, (_JOINTS, 3)) / SCALE
         return poses + added @ turn.transpose(-1, -2), state
 
 
-def train(
-    motion: MotionClips, steps: int, seed: int, track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x
-) -> MotionModel:
+def train(motion: MotionClips, steps: int, seed: int, track: Track = lambda x: x) -> MotionModel:
     """Train to predict the next pose, with a mean square loss."""
     torch.manual_seed(seed)
     rng, net = np.random.default_rng((seed, 2)), MotionModel()
 
     def loss() -> Tensor:
-        truth = _batch_first(_turned(motion.positions[windows(motion, _FRAMES, _BATCH, rng)], rng))
+        truth = _batch_first(_turned(motion.positions[windows(motion, FRAMES, BATCH, rng)], rng))
         now = truth[:, :-1]
         error = net(now, torch.diff(now, dim=1, prepend=now[:, :1]))[0] - truth[:, 1:]
-        return (_SCALE * error).square().mean()
+        return (SCALE * error).square().mean()
 
     return descend(net, loss, steps, 3e-3, track)
 

@@ -24,14 +24,9 @@ rotations and roots (C, T, 3)."""
 
 def zero_velocity(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:
     """Hold the last pose before the gap."""
-    rows = held_rows(positions)
-    return rotations[:, rows], positions[:, rows, 0]
-
-
-def held_rows(positions: Floats) -> NDArray[np.intp]:
-    """Return the index of the last known frame at each frame, (T,), for clips with the same gap."""
     known = np.isfinite(positions[0, :, 0, 0])
-    return np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+    rows = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+    return rotations[:, rows], positions[:, rows, 0]
 
 
 def slerp_and_lerp(positions: Floats, rotations: Floats, offsets: Floats) -> tuple[Floats, Floats]:

@@ -1,19 +1,28 @@
-"""Kalman filters of a constant derivative with fixed-lag smoothing, over many joints at once.
+"""Kalman filters: of a constant derivative with fixed-lag smoothing, joint by joint, and of the whole body.
 
-A textbook implementation for comparison (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The smoother is
-the filter of a state that includes the last positions (Anderson and Moore 1979, section 7.3), which equals Rauch, Tung
-and Striebel's backward sweep over these frames.
+The first is a textbook implementation for comparison (Bar-Shalom, Li and Kirubarajan 2001, sections 6.2 and 8.6). The
+smoother is the filter of a state that includes the last positions (Anderson and Moore 1979, section 7.3), which equals
+Rauch, Tung and Striebel's backward sweep over these frames.
+
+The second is a baseline for hidden joints. Its state is the position and velocity of 22 joints. Velocities are damped,
+and joints accelerate with the covariance of training motion (`prior.models.mixture.tracks`), the only thing learned. It
+is the same for x, y and z, so one covariance (44, 44) serves all three axes. A hidden joint contributes no measurement;
+it follows from the others'.
 """
 
 from __future__ import annotations
 
+import math
 from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 
+from steadypose.benchmarks.baselines.body import beside
 from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
+from steadypose.prior.models.mixture.tracks import body_covariance
+from steadypose.prior.timing.rate import FPS
 
 _UNKNOWN = (1e3, 1.0, 5.0)
 """Standard deviations of a joint never observed: metres, m/s, m/s²."""
@@ -129,3 +138,81 @@ def _smooth(z, variance, forward, added, unknown, delay, answers, likelihood):  
         if known:
             for t in range(max(frames - delay, 0), frames):
                 answers[t, j] = place[t % lags]
+
+
+MIN_SIGMA = 0.01
+"""Standard deviation of a measurement along an axis, metres. Modes are not exact: with less, a joint's noise moves
+hidden joints."""
+
+
+def whole_body_kalman(seen: Floats, stamps_s: Floats, delay: int, density: float, damping: float) -> Floats:
+    """Return joints (T, C, 22, 3) metres, z up, with hidden ones (NaN) estimated by the filter from the measurements up
+    to their own frame.
+
+    ``density`` is the mean process density of the joints, m²/s³, ``damping`` that of velocities, 1/s.
+    """
+    answers, clips = beside(seen, stamps_s, delay), seen.shape[1]
+    # positions in metres, NaN before the first measurement, then velocities in m/s; deviations of 1 m and 1 m/s
+    mean, covariance = np.zeros((clips, 44, 3)), np.tile(np.eye(44), (clips, 1, 1))
+    mean[:, :22] = np.nan
+    for t, frame in enumerate(np.ascontiguousarray(seen)):
+        step = stamps_s[t] - stamps_s[t - 1] if t else 1 / FPS
+        for clip, measured in enumerate(frame):
+            _step(mean[clip], covariance[clip], measured, body_covariance(), step, density, damping)
+            hidden = np.isnan(measured[:, 0]) & np.isfinite(mean[clip, :22, 0])
+            answers[t, clip, hidden] = mean[clip, :22][hidden]
+    return answers
+
+
+@njit(cache=True)
+def _step(mean, covariance, measured, modes, dt, density, damping):  # pragma: no cover
+    """Predict a body's state by ``dt`` seconds, and update it by each measured joint (22, 3) metres, NaN if missing, in
+    turn. ``modes`` (22, 22) is the covariance of joint accelerations, of mean variance 1.
+    """
+    joints, kept = 22, math.exp(-damping * dt)
+    moved = (1.0 - kept) / damping
+    twice = (1.0 - kept * kept) / (2.0 * damping)
+    of_speed = density * twice
+    of_both = density * (moved - twice) / damping
+    of_place = density * (dt - 2.0 * moved + twice) / damping**2
+    for i in range(joints):
+        for axis in range(3):
+            mean[i, axis] += moved * mean[joints + i, axis]
+            mean[joints + i, axis] *= kept
+    for i in range(joints):
+        for j in range(joints):
+            xx, xv, vx, vv = (
+                covariance[i, j],
+                covariance[i, joints + j],
+                covariance[joints + i, j],
+                covariance[joints + i, joints + j],
+            )
+            noise = modes[i, j]
+            covariance[i, j] = xx + moved * (xv + vx) + moved * moved * vv + of_place * noise
+            covariance[i, joints + j] = kept * (xv + moved * vv) + of_both * noise
+            covariance[joints + i, j] = kept * (vx + moved * vv) + of_both * noise
+            covariance[joints + i, joints + j] = kept * kept * vv + of_speed * noise
+    for joint in range(joints):
+        if math.isfinite(measured[joint, 0]):
+            _measure(mean, covariance, joint, measured[joint])
+
+
+@njit(cache=True)
+def _measure(mean, covariance, joint, measured):  # pragma: no cover
+    if math.isnan(mean[joint, 0]):
+        # the first measurement is independent of all other joints
+        for k in range(len(mean)):
+            covariance[joint, k] = covariance[k, joint] = 0.0
+        covariance[joint, joint] = MIN_SIGMA * MIN_SIGMA
+        for axis in range(3):
+            mean[joint, axis] = measured[axis]
+        return
+    row = covariance[joint].copy()
+    inverse = 1.0 / (row[joint] + MIN_SIGMA * MIN_SIGMA)
+    off = measured - mean[joint]
+    for k in range(len(mean)):
+        gain = row[k] * inverse
+        for axis in range(3):
+            mean[k, axis] += gain * off[axis]
+        for j in range(len(mean)):
+            covariance[k, j] -= gain * row[j]

@@ -8,21 +8,22 @@ about the vertical at random, and mirrored.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from steadypose.benchmarks.baselines.filters import hold_last, missing
-from steadypose.benchmarks.baselines.smoothnet import corrupt, descend, windows
+from steadypose.benchmarks.baselines.smoothnet import Track, corrupt, descend, windows
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
 
-_WIDTH = 256
-_SCALE = 5.0  # units per metre in the network
-_BATCH, _FRAMES = 32, 60
+WIDTH, BATCH, FRAMES = 256, 32, 60
+"""Units of the network; clips per step, and their length."""
+SCALE = 5.0
+"""Units per metre in the network."""
 _JOINTS = len(MIRROR)
 
 
@@ -32,18 +33,15 @@ class RecurrentDenoiser(nn.Module):
     def __init__(self, delays: Sequence[int]) -> None:
         super().__init__()
         self.delays = tuple(delays)
-        self.gru = nn.GRU(7 * _JOINTS, _WIDTH, batch_first=True)
+        self.gru = nn.GRU(7 * _JOINTS, WIDTH, batch_first=True)
         seen, asked = 7 * _JOINTS * len(self.delays), 3 * _JOINTS * len(self.delays)
-        self.decode = nn.Linear(_WIDTH + seen, asked)
+        self.decode = nn.Linear(WIDTH + seen, asked)
 
     def forward(self, held: Tensor, gone: Tensor) -> Tensor:
-        moved = torch.diff(held, dim=1, prepend=held[:, :1])
-        origin, turn = held[:, :, J["pelvis"], None], _headings(held)
-        x = torch.cat([_SCALE * (held - origin) @ turn, 10 * _SCALE * moved @ turn, gone[..., None]], dim=-1)
-        x = x.flatten(2)
+        x, turn = _in_body_frame(held, gone)
         # keep the noise of earlier frames out of the state
         known = torch.cat([self.gru(x)[0], self.at_delay(x).flatten(2)], dim=-1)
-        added = self.decode(known).unflatten(-1, (len(self.delays), _JOINTS, 3)) / _SCALE
+        added = self.decode(known).unflatten(-1, (len(self.delays), _JOINTS, 3)) / SCALE
         return self.at_delay(held) + added @ turn[:, :, None].transpose(-1, -2)
 
     def at_delay(self, values: Tensor) -> Tensor:
@@ -53,18 +51,14 @@ class RecurrentDenoiser(nn.Module):
 
 
 def train(
-    motion: MotionClips,
-    delays: Sequence[int],
-    steps: int,
-    seed: int,
-    track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x,
+    motion: MotionClips, delays: Sequence[int], steps: int, seed: int, track: Track = lambda x: x
 ) -> RecurrentDenoiser:
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng, net = np.random.default_rng((seed, 1)), RecurrentDenoiser(delays)
 
     def loss() -> Tensor:
-        truth = _turned(motion.positions[windows(motion, _FRAMES, _BATCH, rng)], rng)
+        truth = _turned(motion.positions[windows(motion, FRAMES, BATCH, rng)], rng)
         error = net(*_inputs(corrupt(truth, rng))) - net.at_delay(_batch_first(truth))
         return error.abs().mean() + error.diff(n=2, dim=1).abs().mean()
 
@@ -87,6 +81,14 @@ def smooth(net: RecurrentDenoiser, seen: Floats) -> list[Floats]:
             answer[len(seen) - 1 - back] = found[len(seen) - 1 - back + net.delays[nearest], :, nearest]
         answers.append(answer)
     return answers
+
+
+def _in_body_frame(held: Tensor, gone: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the input (N, T, 154) about the pelvis, in the frames (N, T, 3, 3) of the hips, and these frames."""
+    moved = torch.diff(held, dim=1, prepend=held[:, :1])
+    origin, turn = held[:, :, J["pelvis"], None], _headings(held)
+    x = torch.cat([SCALE * (held - origin) @ turn, 10 * SCALE * moved @ turn, gone[..., None]], dim=-1)
+    return x.flatten(2), turn
 
 
 def _headings(held: Tensor) -> Tensor:

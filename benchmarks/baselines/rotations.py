@@ -1,9 +1,14 @@
-"""Baselines for rotations: a Kalman filter of each joint's orientation, and a recurrent network from positions to 6D
-rotations (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks")."""
+"""Baselines for rotations.
+
+Of all joints: a Kalman filter of each joint's orientation, and a recurrent network from positions to 6D rotations (Zhou
+et al. 2019, "On the Continuity of Rotation Representations in Neural Networks"). Of the root, frame by frame: the line
+of hips and shoulders, the rest pose's trunk laid on the joints, and that corrected by a ridge regression on the whole
+body.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -11,18 +16,18 @@ from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from steadypose.benchmarks.baselines.recurrent import _batch_first, _headings, _inputs
-from steadypose.benchmarks.baselines.smoothnet import corrupt, descend, windows
+from steadypose.benchmarks.baselines.recurrent import BATCH, FRAMES, WIDTH, _batch_first, _in_body_frame, _inputs
+from steadypose.benchmarks.baselines.smoothnet import Track, corrupt, descend, windows
+from steadypose.benchmarks.corruption import gaussian
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import REST_POSITIONS, TRUNK, J
+from steadypose.prior.models.posture import trunk_frame
 from steadypose.prior.timing.rate import FPS
 
 DENSITIES = tuple(10.0**power for power in range(-1, 6))
 """Process densities that are searched, rad²/s³, over the noise's variance in units of 0.01 rad²."""
-
-_WIDTH, _SCALE, _BATCH, _FRAMES = 256, 5.0, 32, 60
 
 
 def smooth_rotations(seen: Floats, density: float, lag: int) -> Floats:
@@ -70,14 +75,12 @@ class RotationNet(nn.Module):
     def __init__(self, joints: Sequence[int], lag: int) -> None:
         super().__init__()
         self.joints, self.lag = list(joints), lag
-        self.gru = nn.GRU(7 * len(J), _WIDTH, batch_first=True)
-        self.decode = nn.Linear(_WIDTH, 6 * len(self.joints))
+        self.gru = nn.GRU(7 * len(J), WIDTH, batch_first=True)
+        self.decode = nn.Linear(WIDTH, 6 * len(self.joints))
 
     def forward(self, held: Tensor, gone: Tensor) -> Tensor:
-        moved = torch.diff(held, dim=1, prepend=held[:, :1])
-        origin, turn = held[:, :, J["pelvis"], None], _headings(held)
-        x = torch.cat([_SCALE * (held - origin) @ turn, 10 * _SCALE * moved @ turn, gone[..., None]], dim=-1)
-        six = self.decode(self.gru(x.flatten(2))[0]).unflatten(-1, (len(self.joints), 2, 3))
+        x, turn = _in_body_frame(held, gone)
+        six = self.decode(self.gru(x)[0]).unflatten(-1, (len(self.joints), 2, 3))
         first = nn.functional.normalize(six[..., 0, :], dim=-1)
         second = six[..., 1, :] - (first * six[..., 1, :]).sum(dim=-1, keepdim=True) * first
         second = nn.functional.normalize(second, dim=-1)
@@ -86,11 +89,7 @@ class RotationNet(nn.Module):
 
 
 def train_rotations(
-    motion: MotionClips,
-    joints: Sequence[int],
-    lag: int,
-    steps: int,
-    track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x,
+    motion: MotionClips, joints: Sequence[int], lag: int, steps: int, track: Track = lambda x: x
 ) -> RotationNet:
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(0)
@@ -98,8 +97,8 @@ def train_rotations(
     truth = global_rotations(motion.rotations)[:, :, net.joints]
 
     def loss() -> Tensor:
-        picked = windows(motion, _FRAMES, _BATCH, rng)
-        spun = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (_BATCH, 1))).as_matrix()
+        picked = windows(motion, FRAMES, BATCH, rng)
+        spun = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi, (BATCH, 1))).as_matrix()
         seen = corrupt(np.einsum("bij,tbkj->tbki", spun, motion.positions[picked]), rng)
         wanted = _batch_first(spun[:, None] @ truth[picked])
         return (net(*_inputs(seen))[:, lag:] - wanted[:, : wanted.shape[1] - lag]).abs().mean()
@@ -112,3 +111,50 @@ def predict_rotations(net: RotationNet, seen: Floats) -> Floats:
     """Return orientations (T, C, R, 3, 3) of joints (T, C, 22, 3); the last ``lag`` frames repeat the last one."""
     padded = np.concatenate([seen, np.repeat(seen[-1:], net.lag, axis=0)])
     return net(*_inputs(padded)).numpy().swapaxes(0, 1)[net.lag :].astype(np.float64)
+
+
+RIDGE, NOISE = 1e-3, 0.02
+"""Ridge penalty of standardised features, per frame; and noise along an axis in which the ridge regression is fitted,
+metres."""
+
+Baseline = Callable[[Floats], Floats]
+"""Maps joints (N, 22, 3) metres to root orientations (N, 3, 3), up to a constant rotation."""
+
+
+def kabsch(positions: Floats) -> Floats:
+    """Return the rotation (N, 3, 3) that brings the rest pose's trunk nearest to the trunk's joints (Kabsch 1976)."""
+    trunk = list(TRUNK)
+    seen, rest = positions[:, trunk], REST_POSITIONS[trunk]
+    across = np.einsum("nja,jb->nab", seen - seen.mean(axis=1, keepdims=True), rest - rest.mean(axis=0))
+    u, _, vt = np.linalg.svd(across)
+    u[..., -1] *= np.linalg.det(u @ vt)[:, None]
+    return u @ vt
+
+
+def ridge(clips: MotionClips, seed: int) -> Baseline:
+    """Correct `kabsch` by a ridge regression on all joints in its frame, fitted to these clips with noise."""
+    truth = clips.positions.reshape(-1, 22, 3)
+    noisy = gaussian(truth, NOISE, np.random.default_rng(seed))
+    turned = kabsch(noisy)
+    target = Rotation.from_matrix(turned.swapaxes(-1, -2) @ clips.rotations.reshape(-1, 22, 3, 3)[:, 0]).as_rotvec()
+    x = _features(noisy, turned)
+    mean, scale = x.mean(axis=0), x.std(axis=0) + 1e-6
+    x = (x - mean) / scale
+    fitted = np.linalg.solve(x.T @ x + RIDGE * len(x) * np.eye(x.shape[1]), x.T @ (target - target.mean(axis=0)))
+
+    def corrected(positions: Floats) -> Floats:
+        turned = kabsch(positions)
+        vector = (_features(positions, turned) - mean) / scale @ fitted + target.mean(axis=0)
+        return turned @ Rotation.from_rotvec(vector).as_matrix()
+
+    return corrected
+
+
+def _features(positions: Floats, turned: Floats) -> Floats:
+    """Return the joints (N, 66) about the trunk's middle, in its frame."""
+    return ((positions - positions[:, list(TRUNK)].mean(axis=1, keepdims=True)) @ turned).reshape(len(positions), -1)
+
+
+def baselines(clips: MotionClips, seed: int) -> Mapping[str, Baseline]:
+    """Return the baselines by name; ``clips`` are of training people."""
+    return {"hips and shoulders": trunk_frame, "trunk, Kabsch": kabsch, "trunk, Kabsch and ridge": ridge(clips, seed)}

@@ -27,6 +27,9 @@ _WIDTH, _BLOCKS = 128, 3
 _SCALE = 10.0  # units per metre in the network
 _BATCH = 16  # windows of whole bodies
 
+Track = Callable[[Iterable[int]], Iterable[int]]
+"""Type of what shows the progress of a loop."""
+
 
 class SmoothNet(nn.Module):
     """Maps positions along an axis (N, 32), missing ones held, and their missing mask (N, 32) to positions (N, 32)."""
@@ -48,9 +51,7 @@ class SmoothNet(nn.Module):
         return held + self.decode(x) / _SCALE
 
 
-def train(
-    motion: MotionClips, steps: int, seed: int, track: Callable[[Iterable[int]], Iterable[int]] = lambda x: x
-) -> SmoothNet:
+def train(motion: MotionClips, steps: int, seed: int, track: Track = lambda x: x) -> SmoothNet:
     """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng, net = np.random.default_rng((seed, 1)), SmoothNet()
@@ -66,9 +67,7 @@ def train(
 Network = TypeVar("Network", bound=nn.Module)
 
 
-def descend(
-    net: Network, loss: Callable[[], Tensor], steps: int, rate: float, track: Callable[[Iterable[int]], Iterable[int]]
-) -> Network:
+def descend(net: Network, loss: Callable[[], Tensor], steps: int, rate: float, track: Track) -> Network:
     """Minimise ``loss()`` by Adam, with one cycle of learning rates up to ``rate`` and clipped gradients."""
     optimiser = torch.optim.Adam(net.parameters())
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)

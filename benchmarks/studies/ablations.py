@@ -3,7 +3,7 @@
 A part with a setting is switched off by it. The whole-body experts and the multiple-model estimate's weight in white
 noise have none and are replaced in place. The trajectory's parts are ablated after the default prior, in
 time-correlated noise of 2 cm, with a known floor. Errors are means over people, relative to what ships, paired by clip
-(`benchmarks.intervals`). Some parts move no joint but decide what is flagged: their table has false alarms, and faults
+(`benchmarks.scores`). Some parts move no joint but decide what is flagged: their table has false alarms, and faults
 that are found. Cost is measured on one body with a hidden arm, a frame at a time, so that every part has
 work.
 """
@@ -24,11 +24,10 @@ from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.filters import missing
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated
-from steadypose.benchmarks.intervals import interval, ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.scores import score
+from steadypose.benchmarks.scores import interval, ratio, score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, FAULTS_IN_DEPTH

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from steadypose.benchmarks import product
-from steadypose.benchmarks.baselines.roots import Baseline, baselines
+from steadypose.benchmarks.baselines.rotations import Baseline, baselines
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import side_by_side
 from steadypose.benchmarks.provenance import ROOT, VARIANTS

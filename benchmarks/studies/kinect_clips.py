@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 
-from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import (
     acceleration_error,
     length_variation,
     position_error,
     sigma_ratio,
 )
+from steadypose.benchmarks.scores import interval
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical

@@ -19,19 +19,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks import product
-from steadypose.benchmarks.baselines.roots import Baseline, baselines
 from steadypose.benchmarks.baselines.rotations import (
     DENSITIES,
+    Baseline,
     RotationNet,
+    baselines,
     predict_rotations,
     smooth_rotations,
     train_rotations,
 )
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
-from steadypose.benchmarks.intervals import ratio
 from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.scores import ratio
 from steadypose.benchmarks.studies.humor_fits import seen_joints, shipped, starts_of
 from steadypose.benchmarks.studies.rotations_truth import SCORED, SKIPPED, align, angle, read, score
 from steadypose.prior.arrays import Floats
@@ -133,7 +134,6 @@ def aimed(joints: Floats) -> Floats:
 
 
 def _answers(seen: Floats, roots: Mapping[str, Baseline], net: RotationNet, density: float) -> dict[str, _Turned]:
-    """Run all methods on joints (T, C, 22, 3)."""
     found: dict[str, _Turned] = {}
     joints, unknown = seen, np.full((*seen.shape[:2], 3, 3), np.nan)
     for name, settings in METHODS.items():
@@ -193,7 +193,6 @@ def pair(values: list[float]) -> str:
 
 
 def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
-    """Build a table with a row for each condition and method."""
     rows = []
     for record in records:
         alone, against = record["noise alone"], record["file"]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from steadypose.benchmarks.intervals import interval, people_means, ratio
+from steadypose.benchmarks.scores import interval, people_means, ratio
 
 
 def test_every_person_counts_once_however_often_recorded() -> None:

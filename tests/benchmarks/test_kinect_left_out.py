@@ -17,20 +17,11 @@ from rich.progress import Progress
 
 from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE
 from steadypose.benchmarks.bench import Bench, Tuned
-from steadypose.benchmarks.intervals import interval
 from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.results import Result
+from steadypose.benchmarks.scores import interval
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
-from steadypose.benchmarks.studies.kinect_clips import (
-    SCORED,
-    Clip,
-    Scores,
-    align,
-    deviation,
-    learn_offset,
-    move,
-    score,
-)
+from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, Scores, align, deviation, learn_offset, move, score
 from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Kinect, Method, Stated, run_ours
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from steadypose.benchmarks import output, provenance
-from steadypose.benchmarks.overview import ERRORS, overview, ratios
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
-from steadypose.benchmarks.report import Args, fill, main, page
+from steadypose.benchmarks.report import ERRORS, Args, fill, main, overview, page, ratios
 from steadypose.benchmarks.results import PICTURES, Study, Table, load, save
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
