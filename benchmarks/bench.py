@@ -47,8 +47,6 @@ def search(
     """Search parameters: two thirds of the budget evenly over the logarithms of ``space`` (Sobol), the rest within a
     quarter of its width around the best. ``evaluate`` gives figures, including ``position_mm`` and ``acceleration_mm``.
     """
-    if not space:
-        return Tuned({}, [evaluate({})])
     tried: list[dict[str, float]] = []
     best: Parameters = {}
     low, high = np.log(np.array(list(space.values()))).T
@@ -160,11 +158,6 @@ class Methods(NamedTuple):
     networks: bool = True
     """whether to include the baselines trained here"""
 
-    @classmethod
-    def all(cls, bench: Bench, baselines: Sequence[Baseline] = BASELINES) -> Methods:
-        """Return these baselines and every variant of steadypose."""
-        return cls(baselines, product.PRODUCT, bench.delays)
-
 
 def baselines_of(baselines: Sequence[Baseline], delays: Sequence[int]) -> Iterator[tuple[Baseline, int]]:
     """Yield every baseline with each delay that it supports."""
@@ -179,39 +172,26 @@ def answers(
     stamps_s: Floats,
     tuned: Mapping[tuple[str, int], Tuned],
     title: str,
-    methods: Methods | None = None,
+    methods: Methods,
 ) -> Iterator[Answer]:
     """Run all methods over clips (T, C, 22, 3) with their tuned parameters; a network once for each seed."""
-    methods = methods or Methods.all(bench)
-    delays = methods.delays
 
-    def by_baseline(baseline: Baseline, delay: int) -> list[Answer]:
-        parameters = tuned[baseline.name, delay].parameters
-        return [Answer(baseline.name, delay, stamps_s, baseline.run(seen, stamps_s, delay, **parameters), parameters)]
+    def run() -> Iterator[Answer]:
+        for baseline, delay in baselines_of(methods.baselines, methods.delays):
+            parameters = tuned[baseline.name, delay].parameters
+            positions = baseline.run(seen, stamps_s, delay, **parameters)
+            yield Answer(baseline.name, delay, stamps_s, positions, parameters)
+        if methods.networks:
+            found = [("SmoothNet-style", smoothnet.smooth(net, seen, methods.delays)) for net in bench.smoothnets]
+            for name, by_delay in (*found, (RECURRENT, recurrent.smooth(bench.recurrent, seen))):
+                for delay, positions in zip(methods.delays, by_delay, strict=True):
+                    yield Answer(name, delay, stamps_s, positions, {})
+        for name, settings in methods.product.items():
+            for delay in methods.delays:
+                cleaned = product.run(settings, seen, stamps_s, delay)
+                yield Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)
 
-    def by_network(number: int) -> list[Answer]:
-        found = smoothnet.smooth(bench.smoothnets[number], seen, delays)
-        return [
-            Answer("SmoothNet-style", delay, stamps_s, positions, {})
-            for delay, positions in zip(delays, found, strict=True)
-        ]
-
-    def by_recurrent() -> list[Answer]:
-        found = zip(delays, recurrent.smooth(bench.recurrent, seen), strict=True)
-        return [Answer(RECURRENT, delay, stamps_s, positions, {}) for delay, positions in found]
-
-    def by_product(name: str, delay: int) -> list[Answer]:
-        cleaned = product.run(methods.product[name], seen, stamps_s, delay)
-        return [Answer(name, delay, cleaned.stamps_s, cleaned.positions, {}, cleaned.sigma)]
-
-    jobs: list[Callable[[], list[Answer]]] = [
-        partial(by_baseline, *one) for one in baselines_of(methods.baselines, delays)
-    ]
-    if methods.networks:
-        jobs += [*(partial(by_network, number) for number in range(len(bench.seeds))), by_recurrent]
-    jobs += [partial(by_product, name, delay) for name, settings in methods.product.items() for delay in delays]
-    for job in bench.progress.track(jobs, description=title):
-        yield from job()
+    yield from bench.progress.track(run(), description=title)
 
 
 def tune(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.filters import BASELINES, Baseline, missing
 from steadypose.benchmarks.bench import (
     RECURRENT,
@@ -64,7 +65,7 @@ def run_conditions(
     records: list[dict[str, Any]] = []
     calibration: list[dict[str, Any]] = []
     tried: dict[str, Any] = {}
-    some = clips.every(TUNED_ON)
+    some, methods = clips.every(TUNED_ON), Methods(baselines, product.PRODUCT, bench.delays)
     for number, (name, corrupt) in enumerate(conditions.items()):
         other = corrupt(some.positions, np.random.default_rng((number, 1)))
         tuned = tune_on(bench, other, some.positions, clips.stamps_s, name, baselines)
@@ -72,7 +73,7 @@ def run_conditions(
         seen = corrupt(clips.positions, np.random.default_rng((number, 0)))
         hidden = missing(seen)
         scored: list[dict[str, Any]] = []
-        for answer in answers(bench, seen, clips.stamps_s, tuned, name, Methods.all(bench, baselines)):
+        for answer in answers(bench, seen, clips.stamps_s, tuned, name, methods):
             scored.append(_record(name, answer, score(answer.positions, clips.positions, hidden)))
             if answer.sigma is not None:
                 error = position_error(answer.positions, clips.positions)
