@@ -20,7 +20,7 @@ from steadypose.benchmarks.motion import side_by_side
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import HIPS
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.recordings import trunk_frame
 
@@ -33,7 +33,6 @@ _OTHER_SIDE = [
     KINECT22.joints.index(name[0].translate(_SIDES) + name[1:] if name[1].isupper() else name)
     for name in KINECT22.joints
 ]
-_CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 
 
 @dataclass(frozen=True)
@@ -69,18 +68,14 @@ def smoothed(clips: Sequence[Floats], scored: Sequence[int], delay: int, ahead: 
     result = []
     for number, clip in enumerate(clips):
         answer = to_canonical(KINECT22, late[: len(clip), number])[0]
-        result.append(Smoothed(_in_trunk(early[: len(clip), number]), answer[:, list(scored)], _trunk(answer)))
+        result.append(Smoothed(_in_trunk(early[: len(clip), number]), answer[:, list(scored)], trunk_frame(answer)))
     return result
-
-
-def _trunk(canonical: Floats) -> Floats:
-    return trunk_frame(*(canonical[:, J[name]] for name in _CORNERS))
 
 
 def _in_trunk(kinect: Floats) -> Floats:
     canonical = to_canonical(KINECT22, kinect)[0]
-    hips = (canonical[:, J["left_hip"]] + canonical[:, J["right_hip"]]) / 2
-    return np.einsum("tba,tjb->tja", _trunk(canonical), kinect - hips[:, None]).reshape(len(kinect), -1)
+    hips = canonical[:, HIPS].mean(axis=1)
+    return np.einsum("tba,tjb->tja", trunk_frame(canonical), kinect - hips[:, None]).reshape(len(kinect), -1)
 
 
 def ridge(train: Sequence[Smoothed], truths: Sequence[Floats], penalty: float) -> Callable[[Smoothed], Floats]:

@@ -16,19 +16,14 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 from sklearn.metrics import roc_auc_score
 
-from steadypose.benchmarks.metrics import (
-    acceleration_error,
-    length_variation,
-    position_error,
-    sigma_ratio,
-)
+from steadypose.benchmarks.metrics import acceleration_error, length_variation, position_error, sigma_ratio
 from steadypose.benchmarks.scores import interval
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, J
 from steadypose.training.data.recordings import trunk_frame
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, KinectPair, load_pairs
+from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 SUBJECTS = TRAIN_SUBJECTS + VALIDATION_SUBJECTS
 
@@ -39,6 +34,7 @@ error measures the lag, so no mean includes it."""
 SIDED = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 SCORED = ("head", *(f"{side}_{joint}" for joint in SIDED for side in ("left", "right")))
 """The 13 scored joints: those that both systems have and that are points of the body."""
+_CORNERS = [SCORED.index(f"{side}_{part}") for part in ("hip", "shoulder") for side in ("left", "right")]
 OTHER_SIDE = tuple(SCORED.index(JOINTS[MIRROR[J[name]]]) for name in SCORED)
 BONES = tuple(
     (SCORED.index(f"{side}_{a}"), SCORED.index(f"{side}_{b}"))
@@ -59,13 +55,11 @@ class Clip(NamedTuple):
 
 def read_clips(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
     """Read every n-th clip of each of these subjects."""
-    return [_clip(pair) for subject in subjects for pair in load_pairs(path, (subject,))[::every]]
-
-
-def _clip(pair: KinectPair) -> Clip:
-    scored = [J[name] for name in SCORED]
-    raw = to_canonical(KINECT22, pair.kinect)[0][:, scored]
-    return Clip(pair.name, pair.subject, pair.kinect, raw, pair.vicon[:, scored])
+    scored, clips = [J[name] for name in SCORED], []
+    for pair in (pair for subject in subjects for pair in load_pairs(path, (subject,))[::every]):
+        raw = to_canonical(KINECT22, pair.kinect)[0][:, scored]
+        clips.append(Clip(pair.name, pair.subject, pair.kinect, raw, pair.vicon[:, scored]))
+    return clips
 
 
 OFF = 0.10
@@ -86,8 +80,8 @@ class Scores(NamedTuple):
 def learn_offset(truths: Sequence[Floats], aligned: Sequence[Floats]) -> Floats:
     """Return the offset (13, 3) in the trunk's frame that moves aligned estimates of each joint to the truth,
     metres."""
-    pairs = zip(truths, aligned, strict=True)
-    return np.nanmean(np.concatenate([np.einsum("tba,tjb->tja", _trunk(a), t - a) for t, a in pairs]), axis=0)
+    apart = [(t - a) @ trunk_frame(a, _CORNERS) for t, a in zip(truths, aligned, strict=True)]
+    return np.nanmean(np.concatenate(apart), axis=0)
 
 
 def score(truths: Sequence[Floats], aligned: Sequence[Floats], offset: Floats) -> Scores:
@@ -111,12 +105,7 @@ def align(truths: Sequence[Floats], estimates: Sequence[Floats]) -> list[Floats]
 
 def move(estimate: Floats, offset: Floats) -> Floats:
     """Add a constant offset (13, 3) in the trunk's frame to an estimate (T, 13, 3)."""
-    return estimate + np.einsum("tab,jb->tja", _trunk(estimate), offset)
-
-
-def _trunk(positions: Floats) -> Floats:
-    corners = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-    return trunk_frame(*(positions[:, SCORED.index(name)] for name in corners))
+    return estimate + np.einsum("tab,jb->tja", trunk_frame(estimate, _CORNERS), offset)
 
 
 def quick_score(clips: Sequence[Clip], answers: Sequence[Floats]) -> dict[str, float]:

@@ -70,11 +70,11 @@ def test_rigid_alignment_is_scipys_leaves_out_what_is_missing_and_never_mirrors(
 
 def test_trunk_frame_turns_with_the_body() -> None:
     corners = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0], [0.02, 0.2, 0.5], [0.02, -0.2, 0.5]])
-    upright = trunk_frame(*corners)
+    upright = trunk_frame(corners, range(4))
     np.testing.assert_allclose(upright[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
     assert upright[2, 2] > 0.99
     rotation = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
-    np.testing.assert_allclose(trunk_frame(*(corners @ rotation.T + 3.0)), rotation @ upright, atol=1e-12)
+    np.testing.assert_allclose(trunk_frame(corners @ rotation.T + 3.0, range(4)), rotation @ upright, atol=1e-12)
     np.testing.assert_allclose(upright.T @ upright, np.eye(3), atol=1e-12)
 
 

@@ -3,7 +3,7 @@ Vicon."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from rich.progress import track
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
-from steadypose.prior.body.skeleton import J, finite_joints
+from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J, finite_joints
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import DATA_SETS
@@ -26,7 +26,6 @@ SPEEDS = (1.0, 1.4, 1.9, 2.5)
 training."""
 
 _FREE = ("CMU (AMC)", "CMU (BVH)", "CMU (expmap)", "CMU (dance)", "CMU (more)", "ReActIdle", "UI-PRMD (Vicon)")
-_TRUNK = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 _ALIGNED = [
     J["head"],
     *(J[f"{side}_{n}"] for n in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")),
@@ -151,7 +150,7 @@ def _pairs(path: Path) -> Pairs:
             kinect = to_canonical(KINECT22, pair.kinect)[0]
             rotation, translation = rigid_alignment(kinect[:, _ALIGNED], pair.vicon[:, _ALIGNED])
             aligned.append(kinect @ rotation.T + translation)
-        frames = [trunk_frame(*(pair.vicon[:, J[name]] for name in _TRUNK)) for pair in clips]
+        frames = [trunk_frame(pair.vicon) for pair in clips]
         apart = [
             np.einsum("tba,tjb->tja", frame, kinect - pair.vicon)
             for frame, kinect, pair in zip(frames, aligned, clips, strict=True)
@@ -165,10 +164,12 @@ def _pairs(path: Path) -> Pairs:
     return Pairs(np.concatenate(seen), np.concatenate(truth), start, np.array(names))
 
 
-def trunk_frame(left_hip: Floats, right_hip: Floats, left_shoulder: Floats, right_shoulder: Floats) -> Floats:
-    """Return the trunk's axes forward, left and up as columns: (..., 3, 3), of joints (..., 3). Up runs from the hips
-    to the shoulders.
+def trunk_frame(joints: Floats, corners: Sequence[int] = (*HIPS, *SHOULDERS)) -> Floats:
+    """Return the trunk's axes forward, left and up as columns, (..., 3, 3), of joints (..., J, 3).
+
+    Up runs from the hips to the shoulders, which are the ``corners``: left hip, right hip, left and right shoulder.
     """
+    left_hip, right_hip, left_shoulder, right_shoulder = (joints[..., corner, :] for corner in corners)
     up = left_shoulder + right_shoulder - left_hip - right_hip
     up = up / np.linalg.norm(up, axis=-1, keepdims=True)
     left = left_shoulder - right_shoulder + left_hip - right_hip
