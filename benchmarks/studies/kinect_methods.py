@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +43,10 @@ class Stated(NamedTuple):
     flagged: NDArray[np.bool_]  # (T,)
 
 
+Run = Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
+"""Maps clips to (T, 13, 3) metres each, and steadypose's further output for them."""
+
+
 @dataclass(frozen=True)
 class Method:
     """A method to clean clips, at one delay."""
@@ -51,24 +55,25 @@ class Method:
     """name in tables"""
     delay: int
     """frames"""
-    run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
-    """maps clips to (T, 13, 3) metres each, and steadypose's further output for them"""
+    run: Run
+    """what it does"""
     parameters: Mapping[str, float] = field(default_factory=dict)
     """tuned parameters"""
 
 
 def run_filter(
     clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats], whole_body: bool = False
-) -> list[Floats]:
-    """Return a filter's estimates of each clip, (T, 13, 3) metres. All clips are processed together, side by side.
+) -> tuple[list[Floats], None]:
+    """Return a filter's estimates of each clip, (T, 13, 3) metres, as a `Run`.
 
-    Most filters receive only the scored joints, in two thirds of the time; others need the ``whole_body``.
+    All clips are processed together, side by side. Most filters receive only the scored joints, in two thirds of the
+    time; others need the ``whole_body``.
     """
     batch = side_by_side([to_canonical(KINECT22, clip.kinect)[0] if whole_body else clip.raw for clip in clips])
     answers = run(batch, np.arange(len(batch)) / FPS)
     if whole_body:
         answers = answers[:, :, [J[name] for name in SCORED]]
-    return [answers[: len(clip.raw), number] for number, clip in enumerate(clips)]
+    return [answers[: len(clip.raw), number] for number, clip in enumerate(clips)], None
 
 
 def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tuple[list[Floats], list[Stated]]:
@@ -108,16 +113,13 @@ class Kinect:
         groups = {subject: [c for c in on if c.subject == subject] for subject in dict.fromkeys(c.subject for c in on)}
 
         def evaluate(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> dict[str, float]:
-            answers = dict(
-                zip(
-                    (c.name for c in on),
-                    run_filter(on, _at(baseline, delay, parameters), baseline.whole_body),
-                    strict=True,
-                )
-            )
+            filtered, _ = run_filter(on, partial(baseline.run, delay=delay, **parameters), baseline.whole_body)
+            answers = dict(zip((c.name for c in on), filtered, strict=True))
             found = {s: quick_score(some, [answers[c.name] for c in some]) for s, some in groups.items()}
             figures = {f"{s} {key}": value for s, some in found.items() for key, value in some.items()}
-            return {**figures, **{key: _mean(found, key) for key in ("position_mm", "acceleration_mm")}}
+            for key in ("position_mm", "acceleration_mm"):
+                figures[key] = round(float(np.mean([own[key] for own in found.values()])), 3)
+            return figures
 
         return tune(self.bench, evaluate, "Kinect", FILTERS)
 
@@ -129,20 +131,17 @@ class Kinect:
             parameters = best_without(left_out, search, baseline)
             if name == "Kalman, constant velocity":
                 densities[delay] = parameters["density"]
-            run = partial(_filtered, run=_at(baseline, delay, parameters), whole_body=baseline.whole_body)
-            yield Method(
-                name, delay, partial(self._once, name=(name, delay, *parameters.values()), run=run), parameters
-            )
+            at = partial(baseline.run, delay=delay, **parameters)
+            run = partial(run_filter, run=at, whole_body=baseline.whole_body)
+            once = partial(self._once, name=(name, delay, *parameters.values()), run=run)
+            yield Method(name, delay, once, parameters)
         for delay in self.bench.delays:
             for seed, net in enumerate(self.bench.smoothnets):
-                run = partial(_filtered, run=partial(_by_network, net=net, delay=delay))
+                run = partial(run_filter, run=partial(_by_network, net=net, delay=delay))
                 yield Method(SMOOTHNET, delay, partial(self._once, name=(SMOOTHNET, delay, seed), run=run))
-        learners = Learners(
-            [c for c in self.taught if c.subject != left_out], densities, 60 if self.bench.quick else 1000
-        )
+        others = [c for c in self.taught if c.subject != left_out]
         for delay in self.bench.delays:
-            yield learners.ridge(delay)
-            yield learners.convolution(delay)
+            yield from learners(others, delay, densities[delay], 60 if self.bench.quick else 1000)
         known = PriorSettings(correct=CorrectSettings(sensor=str(self.correction(left_out))))
         for delay in self.bench.delays:
             run = partial(run_ours, settings=PriorSettings(), delay=delay)
@@ -163,10 +162,7 @@ class Kinect:
         return path
 
     def _once(
-        self,
-        clips: Sequence[Clip],
-        name: tuple[str | float, ...],
-        run: Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]],
+        self, clips: Sequence[Clip], name: tuple[str | float, ...], run: Run
     ) -> tuple[list[Floats], list[Stated] | None]:
         """Run a method that does not depend on the person left out once over all clips, and keep its output by
         ``name``."""
@@ -193,50 +189,22 @@ def best_without(left_out: str, search: Tuned, baseline: Baseline) -> dict[str, 
     return {name: winner[name] for name in baseline.space}
 
 
-class Learners:
-    """The baselines that learn from the Kinect beside Vicon; their clips, smoothed once for each delay."""
+def learners(clips: Sequence[Clip], delay: int, density: float, steps: int) -> Iterator[Method]:
+    """Yield the baselines that learn from these clips of a Kinect beside Vicon, smoothed with this process density."""
+    truths, scored = [clip.centres for clip in clips], [J[name] for name in SCORED]
 
-    def __init__(self, clips: Sequence[Clip], densities: Mapping[int, float], steps: int) -> None:
-        self._densities, self._steps = densities, steps
-        self._truths = [clip.centres for clip in clips]
-        self._lesson = lru_cache(maxsize=1)(partial(self._smoothed, clips))
+    def smoothed(some: Sequence[Clip], ahead: int) -> list[kinect_regression.Smoothed]:
+        return kinect_regression.smoothed([clip.kinect for clip in some], scored, delay, ahead, density)
 
-    def ridge(self, delay: int) -> Method:
-        """Fit the ridge regression."""
-        answer = kinect_regression.ridge(self._lesson(delay, 0), self._truths, RIDGE_PENALTY)
-        return Method(RIDGE, delay, partial(self._run, answer, delay, 0))
+    def method(name: str, ahead: int, answer: Callable[[kinect_regression.Smoothed], Floats]) -> Method:
+        return Method(name, delay, lambda some: ([answer(clip) for clip in smoothed(some, ahead)], None))
 
-    def convolution(self, delay: int) -> Method:
-        """Train the temporal convolution."""
-        ahead = kinect_regression.look_ahead(delay)
-        lesson = self._lesson(delay, ahead)
-        answer = kinect_regression.temporal_convolution(lesson, self._truths, OTHER_SIDE, ahead, self._steps, seed=0)
-        return Method(TCN, delay, partial(self._run, answer, delay, ahead))
-
-    def _run(
-        self, answer: Callable[[kinect_regression.Smoothed], Floats], delay: int, ahead: int, clips: Sequence[Clip]
-    ) -> tuple[list[Floats], None]:
-        return [answer(clip) for clip in self._smoothed(clips, delay, ahead)], None
-
-    def _smoothed(self, clips: Sequence[Clip], delay: int, ahead: int) -> list[kinect_regression.Smoothed]:
-        """Smooth clips for the regressions, with the best parameters for this delay."""
-        scored = [J[name] for name in SCORED]
-        return kinect_regression.smoothed([clip.kinect for clip in clips], scored, delay, ahead, self._densities[delay])
-
-
-def _at(baseline: Baseline, delay: int, parameters: Mapping[str, float]) -> Callable[[Floats, Floats], Floats]:
-    return partial(baseline.run, delay=delay, **parameters)
+    yield method(RIDGE, 0, kinect_regression.ridge(smoothed(clips, 0), truths, RIDGE_PENALTY))
+    ahead = kinect_regression.look_ahead(delay)
+    lesson = smoothed(clips, ahead)
+    net = kinect_regression.temporal_convolution(lesson, truths, OTHER_SIDE, ahead, steps, seed=0)
+    yield method(TCN, ahead, net)
 
 
 def _by_network(seen: Floats, stamps_s: Floats, net: smoothnet.SmoothNet, delay: int) -> Floats:
     return smoothnet.smooth(net, seen, (delay,))[0]
-
-
-def _filtered(
-    clips: Sequence[Clip], run: Callable[[Floats, Floats], Floats], whole_body: bool = False
-) -> tuple[list[Floats], None]:
-    return run_filter(clips, run, whole_body), None
-
-
-def _mean(found: Mapping[str, Mapping[str, float]], key: str) -> float:
-    return round(float(np.mean([figures[key] for figures in found.values()])), 3)

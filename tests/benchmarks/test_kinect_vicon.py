@@ -95,10 +95,10 @@ def test_lost_markers_are_left_out() -> None:
 )
 def test_clips_side_by_side_are_filtered_as_if_alone(run: partial) -> None:
     clips = [clip(0, 12), clip(1, 2), clip(2, 30)]
-    together = run_filter(clips, run)
+    together, _ = run_filter(clips, run)
     for one, answer in zip(clips, together, strict=True):
         assert answer.shape == one.raw.shape
-        np.testing.assert_allclose(answer, run_filter([one], run)[0], atol=1e-12)
+        np.testing.assert_allclose(answer, run_filter([one], run)[0][0], atol=1e-12)
 
 
 def chance_of_order(wrong: np.ndarray, stated: np.ndarray) -> float:
@@ -145,7 +145,7 @@ def test_a_filter_is_chosen_by_the_others_figures() -> None:
 def test_a_filter_of_whole_bodies_gets_all_joints_and_its_scored_ones_are_kept() -> None:
     kinect = np.random.default_rng(0).normal(0, 0.4, (9, 22, 3))
     one = clip(0, 9)._replace(kinect=kinect)
-    (answer,) = run_filter([one], lambda seen, stamps_s: seen + stamps_s[:, None, None, None], whole_body=True)
+    (answer,), _ = run_filter([one], lambda seen, stamps_s: seen + stamps_s[:, None, None, None], whole_body=True)
     expected = to_canonical(KINECT22, kinect)[0][:, [J[name] for name in SCORED]]
     np.testing.assert_allclose(answer, expected + (np.arange(9) / 30)[:, None, None])
 
@@ -236,7 +236,6 @@ def test_regressions_learn_and_run_on_clips_smoothed_for_their_delay(monkeypatch
     monkeypatch.setattr(regression, "smoothed", lambda clips, scored, *given: asked.append(given) or [None])
     monkeypatch.setattr(regression, "ridge", lambda *_: lambda one: one)
     monkeypatch.setattr(regression, "temporal_convolution", lambda *given, seed: asked.append(given[3:]) or given[0])
-    learners = kinect_methods.Learners([clip(0, 12)], {0: 1.0, 8: 2.0}, steps=7)
-    learners.ridge(8).run([clip(1, 12)])
-    learners.convolution(8)
-    assert asked == [(8, 0, 2.0), (8, 0, 2.0), (8, 4, 2.0), (4, 7)]
+    ridge, _ = kinect_methods.learners([clip(0, 12)], 8, 2.0, steps=7)
+    ridge.run([clip(1, 12)])
+    assert asked == [(8, 0, 2.0), (8, 4, 2.0), (4, 7), (8, 0, 2.0)]
