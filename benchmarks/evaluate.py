@@ -94,7 +94,6 @@ def evaluate(
 
 
 def _missing(study: str, mocap: Path | None, data: Path) -> str | None:
-    """Return what this study needs and is missing."""
     if study in PREPARED and not data.is_file():
         return "--data FILE, prepared motion"
     file = SENSORS.get(study)

@@ -187,14 +187,11 @@ def _known() -> frozenset[str]:
 def stale(result: Mapping[str, Any]) -> list[str]:
     """Return what has changed since a result was measured; nothing if it is valid or frozen.
 
-    A frozen result is of a finished study, whose code is only at the commit named by ``frozen``. Results from before
-    2026-11-24 recorded settings and modules, if any, and no output.
+    A frozen result is of a finished study, whose code is only at the commit named by ``frozen``.
     """
     if "frozen" in result:
         return []
-    recorded: Mapping[str, Any] = result.get("measured", {})
-    if not isinstance(result.get("code"), list):
-        return ["output (not recorded)"]
+    recorded: Mapping[str, Any] = result["measured"]
     now = measured(tuple(recorded))
     changed = [name for name, was in recorded.items() if not _is_same(was, now[name])]
     gone = [line.split()[0] for line in result["code"] if line not in _known()]

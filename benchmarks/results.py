@@ -9,7 +9,8 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table as RichTable
@@ -68,14 +69,6 @@ class Result:
     """violated requirements, a line each; the command then fails"""
 
 
-class Study(Protocol):
-    """A study's module. It also has a function ``run`` from a `Bench` to a `Result`."""
-
-    __name__: str
-    DEPENDS_ON: Sequence[str]
-    """Names of what it measures, as in `provenance.measured`. When one of these changes, its results are stale."""
-
-
 def show(table: Table, console: Console) -> None:
     """Print a table, each row in one line, however narrow the console."""
     grid = RichTable(box=None, pad_edge=False, header_style="bold")
@@ -97,10 +90,10 @@ def save(
     command: Sequence[str],
     tables: Sequence[Table],
     data: Mapping[str, Any],
-    study: Study,
+    study: ModuleType,
     directory: Path = RESULTS,
 ) -> Path:
-    """Write ``NAME.json``: the command, the machine, what was measured, the tables, and ``data``.
+    """Write ``NAME.json``: the command, the machine, what the module ``study`` measured, the tables, and ``data``.
 
     Raises:
         UncommittedError: see `require_committed`, which you should call before measuring.

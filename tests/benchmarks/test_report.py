@@ -10,7 +10,7 @@ import pytest
 from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
 from steadypose.benchmarks.report import ERRORS, Args, fill, main, overview, page, ratios
-from steadypose.benchmarks.results import PICTURES, Study, Table, load, save
+from steadypose.benchmarks.results import PICTURES, Table, load, save
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
@@ -28,7 +28,7 @@ PAPER: Any = SimpleNamespace(
 """A study, as far as `save` looks at it."""
 
 
-def saved(folder: Path, name: str = "latency", table: Table = TABLE, study: Study = PAPER) -> dict[str, Any]:
+def saved(folder: Path, name: str = "latency", table: Table = TABLE, study: Any = PAPER) -> dict[str, Any]:
     save(name, COMMAND, [table], {"rows": [1, {"none": float("nan")}]}, study, folder)
     return load(folder)[name]
 
@@ -158,8 +158,6 @@ def test_a_result_is_stale_when_weights_or_what_made_it_have_changed_and_a_finis
     result["measured"]["prior.fit"] = "other"
     assert stale(result) == ["humor weights", "prior.fit", "code (NOISE, gone)"]
     assert stale(result | {"frozen": "abc1234"}) == []
-    del result["code"]
-    assert stale(result) == ["output (not recorded)"]
 
 
 def test_the_outputs_root_mean_square_change_tells_whether_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
