@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -52,22 +52,12 @@ def outputs() -> dict[str, list[float]]:
     """
     paths = sorted(path.parent for path in (PACKAGE / "sim_data").glob("*/metadata.yaml"))
     sensed, given = [_sensed(path) for path in paths], [_given(path) for path in paths[-3:]]
-    default, of_given = (
-        [part for raws in each for part in _answers(raws, PriorSettings())] for each in (sensed, given)
-    )
-    refining = PriorSettings.from_dict({"refine": {"enabled": True}})
-    refined, refined_of_given = (_answers(raws, refining) for raws in (sensed[0], given[0]))
-    return {
-        "pose/clean": projections(values for kind, values in default if kind is PoseClean),
-        "pose/world": projections(values for kind, values in default if kind is PoseWorld),
-        "pose/clean, HM-VAE": projections(values for kind, values in refined if kind is PoseClean),
-        "pose/clean of 22 joints": projections(values for kind, values in of_given if kind is PoseClean),
-        "pose/world of 22 joints": projections(values for kind, values in of_given if kind is PoseWorld),
-        "pose/clean of 22 joints, HM-VAE": projections(
-            values for kind, values in refined_of_given if kind is PoseClean
-        ),
-        "complete": projections(_completed(path) for path in paths[:2]),
-    }
+    found = {"complete": projections(_completed(path) for path in paths[:2])}
+    for joints, streams in (("", sensed), (" of 22 joints", given)):
+        found[f"pose/clean{joints}"], found[f"pose/world{joints}"] = _projected(streams, PriorSettings())
+        refining = PriorSettings.from_dict({"refine": {"enabled": True}})
+        found[f"pose/clean{joints}, HM-VAE"], _ = _projected(streams[:1], refining)
+    return found
 
 
 def _completed(path: Path) -> np.ndarray:
@@ -103,11 +93,15 @@ def _given(path: Path) -> list[PoseRaw]:
     return raws
 
 
-def _answers(raws: Iterable[PoseRaw], settings: PriorSettings) -> Iterator[tuple[type, np.ndarray]]:
-    pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
-    for _, message in stream(((POSE_RAW, raw) for raw in raws), *pipelines):
-        if isinstance(message, PoseClean | PoseWorld):
-            yield type(message), np.concatenate([np.empty(0), *(_numbers(body) for body in message.bodies)])
+def _projected(streams: Iterable[list[PoseRaw]], settings: PriorSettings) -> tuple[list[float], list[float]]:
+    """Return the projections of `pose/clean` and of `pose/world` of all streams."""
+    clean, world = [], []
+    for raws in streams:
+        pipelines = PriorPipeline(settings), TrajectoryPipeline(TrajectorySettings())
+        for _, message in stream(((POSE_RAW, raw) for raw in raws), *pipelines):
+            if isinstance(message, PoseClean | PoseWorld):
+                (clean if isinstance(message, PoseClean) else world).extend(map(_numbers, message.bodies))
+    return projections(clean), projections(world)
 
 
 def _numbers(body: CleanBody | WorldBody) -> np.ndarray:
