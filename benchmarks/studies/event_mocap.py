@@ -20,7 +20,7 @@ from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import spread
 from steadypose.benchmarks.provenance import WORLD_22
 from steadypose.benchmarks.results import Result
-from steadypose.benchmarks.systems.event_scenes import Label, Scene, Score, common, lying, runs, seated
+from steadypose.benchmarks.systems.event_scenes import Label, Scene, Score, common, lying, seated
 from steadypose.benchmarks.systems.events import CAMERA, DELAYS, record_of, scored, table_of
 from steadypose.msgs.types import EventKind, Hand
 from steadypose.prior.arrays import Floats
@@ -32,6 +32,7 @@ from steadypose.prior.sim.motion import Motion
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
 from steadypose.prior.timing.rate import FPS
+from steadypose.training.data.prepare import runs
 
 DEPENDS_ON = (*WORLD_22, "prior.events")
 
@@ -201,10 +202,8 @@ def run(bench: Bench) -> Result:
     other splits those who measure."""
     totals: dict[str, dict[EventKind, Score]] = defaultdict(lambda: defaultdict(Score))
     by_clip: list[dict[str, Any]] = []
-    clips, noise = (
-        mocap_clips(bench.data, bench.split == "test", 1 if bench.quick else CLIPS),
-        NoiseModel.load(KINECT_NOISE),
-    )
+    clips = mocap_clips(bench.data, bench.split == "test", 1 if bench.quick else CLIPS)
+    noise = NoiseModel.load(KINECT_NOISE)
     for number, clip in enumerate(bench.progress.track(clips, description="clips")):
         placing, filming = (np.random.default_rng(s) for s in np.random.SeedSequence([SEED, number]).spawn(2))
         scene = scene_of(clip, placing)

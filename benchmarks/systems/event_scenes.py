@@ -26,6 +26,7 @@ from steadypose.prior.events.features import EXTENT, HAND
 from steadypose.prior.sim.gait import RATE, Stand, Turn, Walk, minimum_jerk, plan
 from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
+from steadypose.training.data.prepare import runs
 
 DOUBT = 0.05
 """Margin beyond a threshold within which detection is optional, metres or radians."""
@@ -201,16 +202,10 @@ def common(person: int, motion: Motion) -> list[Label]:
     up = hips > 0.5 * tall
     trunk = p[:, J["neck"]] - p[:, J["pelvis"]]
     upright = trunk[:, 2] > 0.5 * np.linalg.norm(trunk, axis=1)
+    faces, nearly_faces = turned < s.faces - DOUBT, turned < s.faces + s.faces_margin
     labels = [
         *_while(person, EventKind.NEAR, Hand.NONE, t, away < s.near - DOUBT, away < s.near + s.near_margin),
-        *_while(
-            person,
-            EventKind.FACES_SENSOR,
-            Hand.NONE,
-            t,
-            (turned < s.faces - DOUBT) & up,
-            (turned < s.faces + s.faces_margin) & up,
-        ),
+        *_while(person, EventKind.FACES_SENSOR, Hand.NONE, t, faces & up, nearly_faces & up),
         *_while(person, EventKind.STANDS, Hand.NONE, t, hips > 0.85 * tall, hips > 0.65 * tall),
     ]
     for side, hand in (("left", Hand.LEFT), ("right", Hand.RIGHT)):
@@ -264,12 +259,6 @@ def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bo
             start_s, end_s = max(label.start_s, begin), min(label.end_s, end)
             if label.person == person and start_s < end_s:
                 yield label._replace(start_s=start_s, end_s=end_s)
-
-
-def runs(holds: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the first and one past the last index of each run in which it holds."""
-    edges = np.diff(np.concatenate([[0], holds.astype(int), [0]]))
-    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
 
 
 MOMENTS = (EventKind.ENTERED, EventKind.LEFT)
@@ -336,7 +325,3 @@ def score(told: Sequence[Told], labels: Sequence[Label], undecided: Iterable[Eve
     for t in left:
         scores[t.kind].false += 1
     return dict(scores)
-
-
-def quantile_ms(delays_s: Sequence[float], share: float) -> float:
-    return float(np.quantile(delays_s, share)) * 1e3 if delays_s else float("nan")

@@ -15,7 +15,7 @@ import numpy as np
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.systems.event_scenes import SCENES, Label, Scene, Score, Told, in_view, quantile_ms, score
+from steadypose.benchmarks.systems.event_scenes import SCENES, Label, Scene, Score, Told, in_view, score
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import EventKind, Phase, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.driving import stream
@@ -26,11 +26,11 @@ from steadypose.prior.events.detector import EventSettings
 from steadypose.prior.sim.camera import Camera, film
 from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.streams import START_NS
+from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = (*WORLD, "prior.events")
 
 CAMERA = Camera(position=(0.0, 0.0, 1.4), look_at=(2.6, 0.0, 0.95), fps=30.0, skeleton="kinect22")
-GRID_HZ = 30.0
 DELAYS = (
     "Delays are between stamps of capture, from the onset in the true motion: the prior's own delay, which holds up "
     "every pose, comes on top."
@@ -49,7 +49,7 @@ def worlds_of(raw: Iterable[PoseRaw]) -> Iterator[PoseClean | PoseWorld]:
 def labels_of(scene: Scene) -> list[Label]:
     """Return the labels of a scene as far as its people are in the camera's view."""
     times = scene.motions[0].times
-    t = np.arange(0.0, times[-1], 1.0 / GRID_HZ)
+    t = np.arange(0.0, times[-1], 1.0 / FPS)
     labels = []
     for person, motion in enumerate(scene.motions):
         seen = CAMERA.in_view((motion.at(t).positions - np.array(CAMERA.position)) @ CAMERA.orientation)
@@ -123,7 +123,7 @@ def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str
                 kind,
                 str(found.met + found.missed),
                 *(f"{share:.3f}" for share in (found.precision, found.recall, found.f1)),
-                *(f"{quantile_ms(found.delays_s, share):.0f}" for share in (0.5, 0.95)),
+                *(f"{1e3 * q:.0f}" for q in np.quantile(found.delays_s or [np.nan], (0.5, 0.95))),
             ]
             for kind, found in [*rows, ("all", whole)]
         ],

@@ -14,7 +14,6 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -48,12 +47,6 @@ FIRST_S = 600.0
 BUSY = ", processors busy"
 
 
-def first_start(recording: Path) -> float:
-    """Return the seconds from ``steadypose run`` to the first ``pose/world``, with loops that were never compiled."""
-    with tempfile.TemporaryDirectory() as folder:
-        return _start(recording, {"NUMBA_CACHE_DIR": folder}, FIRST_S)
-
-
 @contextmanager
 def busy() -> Iterator[None]:
     """Keep every processor busy."""
@@ -67,10 +60,11 @@ def busy() -> Iterator[None]:
             other.wait()
 
 
-def _start(recording: Path, environment: Mapping[str, str] = MappingProxyType({}), limit_s: float = START_S) -> float:
+def _start(environment: Mapping[str, str] = MappingProxyType({}), limit_s: float = START_S) -> float:
+    """Return the seconds from ``steadypose run`` to the first ``pose/world``."""
     with tempfile.TemporaryDirectory(prefix="steadypose-") as folder:
         setting = f"transport.directory={json.dumps(folder)}"
-        command = [sys.executable, "-m", "steadypose.nodes.cli", "run", "--input", str(recording), "--set", setting]
+        command = [sys.executable, "-m", "steadypose.nodes.cli", "run", "--input", str(RECORDING), "--set", setting]
         endpoint = Launch.read("replay", [setting]).transport.endpoint("trajectory")
         with Subscriber(endpoint, POSE_WORLD) as subscriber:
             started_s = time.monotonic()
@@ -86,11 +80,11 @@ def _start(recording: Path, environment: Mapping[str, str] = MappingProxyType({}
                 process.wait(60)
 
 
-def restarts(recording: Path, kills: int, progress: Progress) -> dict[str, list[float]]:
+def restarts(kills: int, progress: Progress) -> dict[str, list[float]]:
     """Return the seconds without ``pose/world`` after each kill of each node."""
     found: dict[str, list[float]] = {name: [] for name in POSE_NODES}
     bar = progress.add_task("kills", total=kills * len(POSE_NODES))
-    with running(recording, "input.loop=true") as nodes:
+    with running(RECORDING, "input.loop=true") as nodes:
         _arrivals(nodes, STEADY_S)
         for _ in range(kills):
             for name in POSE_NODES:
@@ -122,10 +116,12 @@ def run(bench: Bench) -> Result:
     """Measure the time to the first pose, and of each node's return after SIGKILL, on this machine."""
     number = 2 if bench.quick else KILLS
     starts = bench.progress.track(range(number), description="starts")
-    found = {FIRST: [first_start(RECORDING)], ALL: [_start(RECORDING) for _ in starts]}
-    found |= restarts(RECORDING, number, bench.progress)
+    with tempfile.TemporaryDirectory() as never_compiled:
+        found = {FIRST: [_start({"NUMBA_CACHE_DIR": never_compiled}, FIRST_S)]}
+    found[ALL] = [_start() for _ in starts]
+    found |= restarts(number, bench.progress)
     with busy():
-        found |= {name + BUSY: gaps for name, gaps in restarts(RECORDING, number, bench.progress).items()}
+        found |= {name + BUSY: gaps for name, gaps in restarts(number, bench.progress).items()}
     return Result([_table(found)], {"seconds without pose/world": found})
 
 

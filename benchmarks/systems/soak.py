@@ -210,7 +210,8 @@ def live(
     optional = {"foxglove": "foxglove", "ros2_bridge": "cyclonedds"}
     names = [*POSE_NODES, "recorder", *(node for node, module in optional.items() if find_spec(module))]
     os.environ |= {"ROS_DOMAIN_ID": str(ROS_DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with _small_disk(folder / "disk") as disk, _free_port() as port:
+    port = _free_port()
+    with _small_disk(folder / "disk") as disk:
         settings = [*_settings(folder / "stepping", disk / "out", lossless=False), f"foxglove.port={port}"]
         # poses are read while faults are injected
         with running_nodes(names, settings) as nodes, ThreadPoolExecutor(1) as another:
@@ -288,10 +289,8 @@ def _faults(nodes: Running, disk: Path, port: int, random_: random.Random) -> di
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
             for place in ROS_PORTS:
                 for _ in range(20):
-                    kind, length = (
-                        random_.choice((0x15, 0x09, 0x07, 0x06, random_.randrange(256))),
-                        random_.randrange(65536),
-                    )
+                    kind = random_.choice((0x15, 0x09, 0x07, 0x06, random_.randrange(256)))
+                    length = random_.randrange(65536)
                     header = b"RTPS\2\3\1\x10" + random_.randbytes(12) + struct.pack("<BBH", kind, 1, length)
                     with suppress(OSError):
                         client.sendto(header + random_.randbytes(random_.randrange(400)), ("127.0.0.1", place))
@@ -352,12 +351,10 @@ def _small_disk(folder: Path) -> Iterator[Path]:
             subprocess.run(["umount", "--lazy", folder], check=True, timeout=30)
 
 
-@contextmanager
-def _free_port() -> Iterator[int]:
+def _free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    yield port
+        return free.getsockname()[1]
 
 
 def _settings(played: Path, out: Path, *, lossless: bool) -> list[str]:
