@@ -5,23 +5,17 @@ Hidden joints are NaN. The functions draw from the generator that you pass and c
 
 from __future__ import annotations
 
-from itertools import chain
-
 import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import MIRROR, J
+from steadypose.prior.body.skeleton import MIRROR, J, limbs
 from steadypose.prior.sim.camera import segment_gap
 from steadypose.prior.sim.noise import time_correlated
 
 Mask = NDArray[np.bool_]
 
-LIMBS: tuple[NDArray[np.intp], ...] = tuple(
-    np.array([J[f"{side}_{joint}"] for joint in joints])
-    for joints in (("elbow", "wrist"), ("knee", "ankle", "foot"))
-    for side in ("left", "right")
-)
+LIMBS = (*limbs(("elbow", "wrist")), *limbs(("knee", "ankle", "foot")))
 """Limbs that a detector loses or swaps: lower arms and legs."""
 
 
@@ -86,7 +80,7 @@ def arm_behind(truth: Floats, radius: float = 0.16) -> Mask:
     left[:, 2] = 0.0
     camera = middle[:, J["pelvis"]] + 3.0 * left / np.linalg.norm(left, axis=-1, keepdims=True)
     camera[:, 2] = 1.2
-    arms = list(chain(LIMBS[0], LIMBS[1]))
+    arms = LIMBS[0] + LIMBS[1]
     points = truth[:, :, arms]
     trunk = (truth[:, :, J[end], None] for end in ("pelvis", "neck"))
     gap, along = segment_gap(np.broadcast_to(camera[:, None], points.shape), points, *trunk)
@@ -100,8 +94,8 @@ def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.
     and ends at least a third of a second before the clip does."""
     hidden = np.zeros(shape, dtype=bool)
     starts = rng.integers(first, shape[0] - frames - 10, endpoint=True, size=shape[1])
-    limbs = rng.integers(len(LIMBS), size=shape[1])
-    for clip, (start, limb) in enumerate(zip(starts, limbs, strict=True)):
+    hit = rng.integers(len(LIMBS), size=shape[1])
+    for clip, (start, limb) in enumerate(zip(starts, hit, strict=True)):
         hidden[start : start + frames, clip, LIMBS[limb]] = True
     return hidden
 

@@ -100,11 +100,8 @@ PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
 }
 
 CONDITIONS: Mapping[str, Condition] = {
-    **{
-        name: noisy_joints.CONDITIONS[name]
-        for name in ("1 cm", "2 cm", "4 cm", "lasting 2 cm", "lasting 2 cm, spikes, swaps")
-    },
-    **{name: hidden_joints.CONDITIONS[name] for name in ("0.5 s", "legs never")},
+    name: (noisy_joints.CONDITIONS | hidden_joints.CONDITIONS)[name]
+    for name in ("1 cm", "2 cm", "4 cm", "lasting 2 cm", "lasting 2 cm, spikes, swaps", "0.5 s", "legs never")
 }
 """Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
 
@@ -155,13 +152,10 @@ def run(bench: Bench) -> Result:
         _table("ablations-world", "The world's parts: joints and standing feet", "mm", world, world_cost, clips),
     ]
     data = {
-        "person": clips.person.tolist(),
-        "data_set": clips.data_set.tolist(),
-        "records": records,
-        "flags": flags,
-        "world": world,
-    }
-    return Result(tables, {"data": clips.source, **data, "ms": cost, "world ms": world_cost})
+        "data": clips.source, "person": clips.person.tolist(), "data_set": clips.data_set.tolist(),
+        "records": records, "flags": flags, "world": world, "ms": cost, "world ms": world_cost,
+    }  # fmt: skip
+    return Result(tables, data)
 
 
 def _flags(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
@@ -243,7 +237,6 @@ def _record(condition: str, name: str, errors: Floats, acceleration: Floats) -> 
 
 
 def _flags_table(records: Sequence[Mapping[str, Any]], cost: Mapping[str, float], clips: MotionClips) -> Table:
-    """Build a table with a row for each part that flags may depend on."""
     percent = {(record["method"], record["condition"]): record["percent"] for record in records}
     rows = []
     for name in FLAGGING:

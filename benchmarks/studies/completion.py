@@ -75,9 +75,7 @@ def run(bench: Bench) -> Result:
     yaw = heading(clips.rotations[:, :, 0]).T
 
     def by(fill: Fill) -> Callable[[Floats, list[int]], Floats]:
-        return lambda given, hidden: np.stack(
-            [complete(fill, *one).positions for one in zip(given, clips.offsets, strict=True)]
-        )
+        return lambda given, hidden: completed(fill, given, clips.offsets)
 
     methods: dict[str, Callable[[Floats, list[int]], Floats]] = {
         "mean pose": by(mean_pose(completer)),
@@ -93,16 +91,8 @@ def run(bench: Bench) -> Result:
         given = truth.copy()
         given[:, :, hidden] = np.nan
         for name, method in methods.items():
-            answer = method(given, hidden)
-            off = np.linalg.norm((answer - answer[:, :, :1]) - (truth - truth[:, :, :1]), axis=-1)[:, :, hidden]
-            error = errors[part, name] = off.mean(axis=(1, 2))
-            bends = [np.linalg.norm(np.diff(x[:, :, hidden], n=2, axis=1), axis=-1).mean() for x in (answer, truth)]
-            records.append(
-                {
-                    "hidden": part, "method": name, "hidden_mm": round(float(error.mean()) * 1e3, 2),
-                    "acceleration_of_true": round(float(bends[0] / bends[1]), 3),
-                }
-            )  # fmt: skip
+            errors[part, name], figures = compared(method(given, hidden), truth, hidden)
+            records.append({"hidden": part, "method": name, **figures})
     ratios = [
         {
             "hidden": part,
@@ -129,26 +119,31 @@ def search(bench: Bench, truth: Floats, offsets: Floats, completer: LiveComplete
     fills = {"mean pose": mean_pose(completer), _NETWORK: parts, _SEARCH: Optimiser.load("default", parts)}
     records: list[dict[str, Any]] = []
     for part, hidden in bench.progress.track(list(HIDDEN.items()), description="search"):
+        given = truth[some].copy()
+        given[:, :, hidden] = np.nan
         for name, fill in fills.items():
             began = time.process_time()
-            errors, bends = [], []
-            for clip in some:
-                given = truth[clip].copy()
-                given[:, hidden] = np.nan
-                both = complete(fill, given, offsets[clip]).positions, truth[clip]
-                about = [(x - x[:, :1])[:, hidden] for x in both]
-                errors.append(np.linalg.norm(about[0] - about[1], axis=-1).mean())
-                bends.append([np.linalg.norm(np.diff(x[:, hidden], n=2, axis=0), axis=-1).mean() for x in both])
-            bent = np.mean(bends, axis=0)
-            records.append(
-                {
-                    "hidden": part, "method": name, "windows": len(some),
-                    "hidden_mm": round(float(np.mean(errors)) * 1e3, 2),
-                    "acceleration_of_true": round(float(bent[0] / bent[1]), 3),
-                    "seconds": round((time.process_time() - began) / len(some), 2),
-                }
-            )  # fmt: skip
+            answer = completed(fill, given, offsets[some])
+            seconds = round((time.process_time() - began) / len(some), 2)
+            _, figures = compared(answer, truth[some], hidden)
+            records.append({"hidden": part, "method": name, "windows": len(some), **figures, "seconds": seconds})
     return records
+
+
+def completed(fill: Fill, given: Floats, offsets: Floats) -> Floats:
+    """Return windows (C, T, 22, 3) of bodies with these bones, completed by `complete`."""
+    return np.stack([complete(fill, *one).positions for one in zip(given, offsets, strict=True)])
+
+
+def compared(answer: Floats, truth: Floats, hidden: list[int]) -> tuple[Floats, dict[str, float]]:
+    """Return each window's error of hidden joints about the root, (C,) metres, and the mean figures of all."""
+    off = np.linalg.norm((answer - answer[:, :, :1]) - (truth - truth[:, :, :1]), axis=-1)[:, :, hidden]
+    bends = [np.linalg.norm(np.diff(x[:, :, hidden], n=2, axis=1), axis=-1).mean() for x in (answer, truth)]
+    error = off.mean(axis=(1, 2))
+    return error, {
+        "hidden_mm": round(float(error.mean()) * 1e3, 2),
+        "acceleration_of_true": round(float(bends[0] / bends[1]), 3),
+    }
 
 
 def whole(clips: MotionClips, completer: LiveCompleter) -> list[dict[str, Any]]:
@@ -198,6 +193,7 @@ def _table(records: list[dict[str, Any]], ratios: list[dict[str, Any]], clips: i
     methods = list(dict.fromkeys(r["method"] for r in records))
     found = {(r["hidden"], r["method"]): r for r in records}
     share = {(r["hidden"], r["baseline"]): f"{r['ratio'][0]:.2f}" for r in ratios}
+    columns = ["complete, of nearest", "of HG-VAE's", "its acceleration, of the true", "HG-VAE's"]
     rows = [
         [
             part,
@@ -210,14 +206,7 @@ def _table(records: list[dict[str, Any]], ratios: list[dict[str, Any]], clips: i
     return Table(
         name="completion",
         title="Parts of the body that nobody sees, mm off",
-        columns=[
-            "hidden",
-            *methods,
-            "complete, of nearest",
-            "of HG-VAE's",
-            "its acceleration, of the true",
-            "HG-VAE's",
-        ],
+        columns=["hidden", *methods, *columns],
         rows=rows,
         note=(
             f"{clips} windows of {FRAMES} frames, spread evenly over the sources; joints hidden in all frames, about "

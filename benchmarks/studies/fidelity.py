@@ -125,13 +125,14 @@ def _tables(records: list[dict[str, Any]], bench: Bench, clips: MotionClips) -> 
         "Baselines tuned for each noise and delay on every third of these clips with other noise; the banks have no "
         "setting. Best filter: the tuned one of the least error in that very cell, of at most that delay."
     )
-    tables = [_summary_table(records, note), *(_source_table(records, delay, clips) for delay in SUMMARISED)]
-    tables += [*(_speed_table(records, delay, note) for delay in (4, 0))]
-    sums = ("fidelity", "Fidelity: MPJPE by noise, mm", "position_mm", 1), (
-        "fidelity-acceleration", "Fidelity: acceleration error by noise, mm/frame²", "acceleration_mm", 2
-    )  # fmt: skip
-    tables += [pivot(records, "condition", key, name, title, note, digits) for name, title, key, digits in sums]
-    return tables
+    return [
+        _summary_table(records, note),
+        *(_source_table(records, delay, clips) for delay in SUMMARISED),
+        *(_speed_table(records, delay, note) for delay in (4, 0)),
+        pivot(records, "condition", "position_mm", "fidelity", "Fidelity: MPJPE by noise, mm", note),
+        pivot(records, "condition", "acceleration_mm", "fidelity-acceleration",
+              "Fidelity: acceleration error by noise, mm/frame²", note, digits=2),
+    ]  # fmt: skip
 
 
 UNTUNED = ("raw", "bank of smoothers", "whole-body bank", "steadypose")
@@ -152,16 +153,14 @@ def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
                     mine = [r for r in mine if r["method"] == name and r["delay"] == delay]
                 else:
                     mine = [r for r in mine if r["method"] not in UNTUNED]
-                cells.append(
-                    " / ".join(f"{min(r[key] for r in mine):.1f}" for key in ("position_mm", "acceleration_mm"))
-                )
+                least = (min(r[key] for r in mine) for key in ("position_mm", "acceleration_mm"))
+                cells.append(" / ".join(f"{value:.1f}" for value in least))
             rows.append([f"delay {delay}: {name}", *cells])
     title = "Fidelity: MPJPE, mm / acceleration error, mm/frame², by independent noise along each axis"
     return Table("fidelity-summary", title, ["method", *noises], rows, note)
 
 
 def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: MotionClips) -> Table:
-    """Build a table of the banks and steadypose by source."""
     errors = {
         (r["condition"], r["method"]): 1e-3 * np.array(r["clips_mm"])
         for r in records

@@ -167,8 +167,9 @@ def run(bench: Bench) -> Result:
 
 
 @torch.no_grad()
-def _elbo(model: HGVAE, windows: Windows, count: int) -> dict[str, float]:
-    positions, sizes = windows.draw(count, model.config.frames, np.random.default_rng(7))
+def _likelihood(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
+    count = 64 if bench.quick else 1024
+    positions, sizes = Windows(motion).draw(count, model.config.frames, np.random.default_rng(7))
     torch.manual_seed(7)
     parts = []
     for start in range(0, count, 128):
@@ -178,11 +179,7 @@ def _elbo(model: HGVAE, windows: Windows, count: int) -> dict[str, float]:
         off = (model(whole.x, whole.certainty).tracks.mean - whole.target) * SCALE * 1000
         parts.append(torch.stack([likelihood, kl, off.square().mean(dim=(1, 2))], dim=1))
     likelihood, kl, square = torch.cat(parts).mean(dim=0).tolist()
-    return {"log_likelihood": likelihood, "kl": kl, "elbo": likelihood - kl, "mse_mm2": square}
-
-
-def _likelihood(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
-    found = _elbo(model, Windows(motion), 64 if bench.quick else 1024)
+    found = {"log_likelihood": likelihood, "kl": kl, "elbo": likelihood - kl, "mse_mm2": square}
     record = {"parameters": sum(p.numel() for p in model.parameters()), **found}
     cells = [f"{record['parameters'] / 1e6:.2f} M", *(f"{found[key]:.0f}" for key in ("log_likelihood", "kl", "elbo"))]
     table = Table(

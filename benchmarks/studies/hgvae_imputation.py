@@ -96,12 +96,11 @@ def impute_all(
     found = {"mean": np.where(masks, mean, truth), "hold": hold, "line": line, "guess": guess_m}
     if model.completion:
         found["completion"] = completed_m
-    passes: dict[str, list[Floats]] = {}
+    one_pass = []
     for t, x, seen in zip(clean, guess, observed.astype(float), strict=True):
-        tracks = t._replace(x=x, observed=seen)
-        reconstruction = live.reconstruct(x[None], seen[None], np.array([BIAS_SIGMA]))
-        passes.setdefault("HG-VAE, one pass", []).append(completed_tracks(tracks, reconstruction.mean[0]))
-    found |= {name: np.stack(windows) for name, windows in passes.items()}
+        mean = live.reconstruct(x[None], seen[None], np.array([BIAS_SIGMA])).mean[0]
+        one_pass.append(completed_tracks(t._replace(x=x, observed=seen), mean))
+    found["HG-VAE, one pass"] = np.stack(one_pass)
     for count in steps:
         found[f"HG-VAE, the paper's ascent, {count} steps"] = ascend_entries(model, line, observed, count)
     return {name: (np.where(masks, x, truth), truth) for name, x in found.items()}
@@ -207,15 +206,9 @@ def sweep(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
     figure = Figure(figsize=(9.5, 4.8), layout="constrained")
     shares, bursts = figure.subplots(1, 2, subplot_kw={"prop_cycle": cycler(color=color_sequences["tab20"])})
     for method in methods:
-        shares.plot(
-            [100 * s for s in FEATURES],
-            [by[method, f"{100 * s:g} % of entries"] ** 0.5 for s in FEATURES],
-            "o-",
-            ms=3,
-            label=method,
-        )
-        bursts.plot(BURSTS_S, [by[method, f"a limb for {s:g} s"] ** 0.5 for s in BURSTS_S],
-                    "o-", ms=3)  # fmt: skip
+        of_entries = [by[method, f"{100 * s:g} % of entries"] ** 0.5 for s in FEATURES]
+        shares.plot([100 * s for s in FEATURES], of_entries, "o-", ms=3, label=method)
+        bursts.plot(BURSTS_S, [by[method, f"a limb for {s:g} s"] ** 0.5 for s in BURSTS_S], "o-", ms=3)
     shares.set(xscale="log", yscale="log", xlabel="entries hidden, %", ylabel="error, mm RMS")
     bursts.set(yscale="log", xlabel="a limb hidden for, s")
     figure.legend(*shares.get_legend_handles_labels(), loc="outside lower center", ncol=3, fontsize=7, frameon=False)

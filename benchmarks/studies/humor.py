@@ -25,11 +25,11 @@ from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_s
 from steadypose.benchmarks.provenance import CLEAN_22, ROOT
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.studies.humor_fits import (
+    CAMERA,
     CAMERA_HEIGHT,
     HIDDEN_BELOW,
     NOISE,
     Answer,
-    camera_settings,
     fitted,
     load_labels,
     pictures,
@@ -38,7 +38,6 @@ from steadypose.benchmarks.studies.humor_fits import (
     shipped,
     starts_of,
 )
-from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet, Rollout, sample
 from steadypose.prior.fit.humor_state import State, states_of
@@ -210,7 +209,8 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hidden: 
     truth = clips.positions
     noise, lowest = (0.0, HIDDEN_BELOW) if hidden else (NOISE, 0.0)
     seen = hide(gaussian(truth, noise, np.random.default_rng(0)), below(truth, lowest))
-    live = {delay: _live(clips, seen, delay) for delay in (4, DELAY)}
+    shipped_settings = product.PRODUCT["steadypose"]
+    live = {delay: product.run(shipped_settings, seen, clips.stamps_s, delay) for delay in (4, DELAY)}
     answers: dict[str, list[Answer]] = {
         _TRUTH: _each(truth),
         "filter bank, offline": _each(bank(seen, clips.stamps_s, FRAMES)),
@@ -220,23 +220,13 @@ def _noisy(bench: Bench, clips: MotionClips, models: dict[str, Any], *, hidden: 
     answers |= {f"steadypose live, delay {delay}": _each(found.positions[-FRAMES:]) for delay, found in live.items()}
     names = (_PER_FRAME, *reversed([*VARIANTS]), SHIPS)
     for name in bench.progress.track(names, description="hidden" if hidden else "noisy"):
-        answers[name] = _fits(models, name, live[DELAY], seen)
+        model, stages = (models[SHIPS], 2) if name == _PER_FRAME else (models[name], 3)
+        answers[name] = [
+            fitted(model, [start], seen_joints(seen[:, c]), stages, FitSettings())
+            for c, start in enumerate(starts_of(live[DELAY], FRAMES))
+        ]
     load, unseen = load_labels(clips), np.isnan(seen[..., 0])
     return [{"method": name, **scores(found, truth, unseen, load)} for name, found in answers.items()]
-
-
-def _live(clips: MotionClips, seen: Floats, delay: int) -> product.Cleaned:
-    """Return `clean`'s live output for clips (T, C, 22, 3)."""
-    return product.run(product.PRODUCT["steadypose"], seen, clips.stamps_s, delay)
-
-
-def _fits(models: dict[str, Any], name: str, live: product.Cleaned, seen: Floats) -> list[Answer]:
-    """Fit each of C clips ``seen`` (T, C, 22, 3), metres, with one model or without one, starting from ``live``."""
-    model, stages = (models[SHIPS], 2) if name == _PER_FRAME else (models[name], 3)
-    return [
-        fitted(model, [start], seen_joints(seen[:, c]), stages, FitSettings())
-        for c, start in enumerate(starts_of(live, FRAMES))
-    ]
 
 
 def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth: bool) -> list[dict[str, Any]]:
@@ -249,7 +239,7 @@ def _pictures(bench: Bench, clips: MotionClips, models: dict[str, Any], *, depth
     records = [{"method": _TRUTH, **scores(_each(truth), truth, unseen, load, -CAMERA_HEIGHT)}]
     for name, (model, stages) in bench.progress.track(fits.items(), description="depth" if depth else "detector"):
         found = [
-            fitted(model, track.starts, track.observed, stages, camera_settings())
+            fitted(model, track.starts, track.observed, stages, CAMERA)
             for track in (picture.deep if depth else picture.flat for picture in taken)
         ]
         records.append({"method": name, **scores(found, truth, unseen, load, -CAMERA_HEIGHT)})

@@ -138,9 +138,8 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
     return Pictures(truth, np.asarray(np.isfinite(pixels).all(axis=-1)), flat, deep)
 
 
-def camera_settings() -> FitSettings:
-    """Return the settings of ``steadypose fit`` for a camera of known height."""
-    return replace(PICTURES, ground_height_sigma=0.05)
+CAMERA = replace(PICTURES, ground_height_sigma=0.05)
+"""Settings of ``steadypose fit`` for a camera of known height."""
 
 
 def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], contacts: NDArray[np.bool_],
@@ -156,9 +155,7 @@ def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], 
         "all_mm": _mm(error), "seen_mm": _mm(np.where(hidden, np.nan, error)),
         "legs_mm": _mm(error[..., LEGS]), "rooted_mm": _mm(rooted),
         "acceleration_m_s2": round(float(np.linalg.norm(np.diff(said, n=2, axis=0), axis=-1).mean()) * FPS**2, 2),
-        "acceleration_error_m_s2": round(
-            float(np.mean([acceleration_error(said[:, c], truth[:, c]) for c in range(said.shape[1])])) * FPS**2, 2
-        ),
+        "acceleration_error_m_s2": round(float(acceleration_error(said, truth).mean()) * FPS**2, 2),
         "penetration_percent": round(100 * float(np.mean([depth > limit for limit in DEPTHS])), 2),
         "penetration_mm": _mm(np.maximum(depth, 0.0)),
     }  # fmt: skip

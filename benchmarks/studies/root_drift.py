@@ -9,7 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.prior.arrays import Floats
@@ -145,10 +145,10 @@ class Errors:
         last, path = np.array(self.hidden_position[HORIZONS[-1]]), np.array(self.hidden_path)
         walked = path > 1.0
         return {
-            "seen: root cm": 100 * _rms(self.seen_position),
+            "seen: root cm": 100 * rms(self.seen_position),
             "seen: skate m/s": float(np.mean(self.seen_skate)),
             "hidden: skate m/s": float(np.mean(self.hidden_skate)),
-            **{f"hidden {h * FRAME_S:g} s: root cm": 100 * _rms(e) for h, e in self.hidden_position.items()},
+            **{f"hidden {h * FRAME_S:g} s: root cm": 100 * rms(e) for h, e in self.hidden_position.items()},
             "hidden: m per 10 m walked": float(10 * last[walked].sum() / path[walked].sum())
             if walked.any()
             else np.nan,
@@ -159,17 +159,18 @@ class Errors:
         }
 
 
-def _rms(values: list[float]) -> float:
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def evaluate_fusion(clips: list[Clip], methods: Mapping[str, Method]) -> dict[str, Errors]:
-    """Run every method over every clip; "as observed" is the input."""
-    errors = {name: Errors() for name in ("as observed", *methods)}
+def evaluate_fusion(clips: list[Clip]) -> dict[str, Errors]:
+    """Run all `METHODS` over every clip; "as observed" is the input."""
+    errors = {name: Errors() for name in ("as observed", *METHODS)}
     for number, clip in enumerate(clips):
         messages = observe(clip, np.random.default_rng((0, number)))
         seen = np.stack([m.bodies[0].positions for m in messages]).astype(np.float64)
         errors["as observed"].add(clip, seen, np.full((len(seen), 3), ROOT_NOISE))
-        for name, method in methods.items():
+        for name, method in METHODS.items():
             errors[name].add(clip, *method(messages))
     return errors

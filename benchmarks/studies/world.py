@@ -8,7 +8,7 @@ seconds at a time, the drift of the root per 10 m of path (`benchmarks.studies.r
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -25,7 +25,7 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import figures, score, source_table
-from steadypose.benchmarks.studies.root_drift import METHODS, Clip, evaluate_fusion
+from steadypose.benchmarks.studies.root_drift import Clip, evaluate_fusion, rms
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.body.skeleton import JOINTS, limbs
@@ -68,18 +68,17 @@ def run(bench: Bench) -> Result:
             errors[baseline.name] = _per_clip(clips, answer)
     by_speed: dict[str, dict[str, float]] = {}
     for name, settings in bench.progress.track(product.PRODUCT.items(), description="world"):
-        clean, world, roots = chain(settings, seen, clips.stamps_s)
+        clean, world, velocities, spreads = chain(settings, seen, clips.stamps_s)
         records.append({"method": f"{name}: pose/clean", "delay": DELAY, **measure(clips, clean)})
         records.append({"method": f"{name}: pose/world", "delay": DELAY, **measure(clips, world)})
         errors |= {f"{name}: pose/clean": _per_clip(clips, clean), f"{name}: pose/world": _per_clip(clips, world)}
         if name == "steadypose":
-            by_speed = root_by_speed(clips, roots)
+            by_speed = root_by_speed(clips, world[:, :, 0], velocities, spreads)
     quaternions = roma.rotmat_to_unitquat(torch.from_numpy(clips.rotations)).numpy()
     hidden = {
         name: {key: round(value, 4) for key, value in errors.summary().items()}
         for name, errors in evaluate_fusion(
-            [Clip(clips.positions[:, c], quaternions[:, c], clips.contacts[:, c]) for c in range(len(clips.offsets))],
-            METHODS,
+            [Clip(clips.positions[:, c], quaternions[:, c], clips.contacts[:, c]) for c in range(len(clips.offsets))]
         ).items()
         if name != "as observed"
     }
@@ -91,42 +90,22 @@ def run(bench: Bench) -> Result:
         "world-sources", f"In the world, through noise of 2 cm that lasts: joints by source, mm, delay {DELAY}",
         {("no alignment", name): found for name, found in errors.items()}, clips, best,
     )  # fmt: skip
-    return Result(
-        [
-            sources,
-            _table(records, len(clips.offsets)),
-            _root_table(by_speed),
-            _hidden_table(hidden),
-        ],
-        {
-            "data": source,
-            "records": records,
-            "root by speed": by_speed,
-            "root hidden": hidden,
-            "tuning": tuning_log(tuned),
-        },
-    )
-
-
-@dataclass(frozen=True)
-class Roots:
-    """The roots of `pose/world`, in the world; NaN without an estimate.
-
-    Attributes:
-        positions, velocities: (T, C, 3) metres and m/s.
-        spreads: (T, C, 6) predicted standard deviations of both.
-    """
-
-    positions: Floats
-    velocities: Floats
-    spreads: Floats
+    data = {
+        "data": source, "records": records, "root by speed": by_speed, "root hidden": hidden,
+        "tuning": tuning_log(tuned),
+    }  # fmt: skip
+    tables = [sources, _table(records, len(clips.offsets)), _root_table(by_speed), _hidden_table(hidden)]
+    return Result(tables, data)
 
 
 def chain(
     settings: product.PriorSettings, seen: Floats, stamps_s: Floats, world_settings: TrajectorySettings | None = None
-) -> tuple[Floats, Floats, Roots]:
-    """Run clips (T, C, 22, 3), calibrated, through prior and trajectory; return pose/clean and pose/world, (T, C, 22,
-    3)."""
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Run clips (T, C, 22, 3), calibrated, through prior and trajectory.
+
+    Returns pose/clean and pose/world, (T, C, 22, 3); the velocities of the root, (T, C, 3) m/s; and the predicted
+    standard deviations of its position and velocity, (T, C, 6). All are NaN without an estimate.
+    """
     count = seen.shape[1]
     prior = PriorPipeline(replace(settings, delay=DELAY, max_bodies=product.SLOTS_A_CLIP * count))
     trajectory = TrajectoryPipeline(world_settings or TrajectorySettings(weights=settings.refine.weights))
@@ -140,14 +119,19 @@ def chain(
                 world[row, body.id] = body.positions
                 velocities[row, body.id] = body.root_velocity
                 spreads[row, body.id] = np.sqrt(np.diag(body.covariance))
-    return clean, world, Roots(world[:, :, 0], velocities, spreads)
+    return clean, world, velocities, spreads
 
 
-def root_by_speed(clips: MotionClips, roots: Roots) -> dict[str, dict[str, float]]:
-    """Return errors of root and velocity by the root's true speed: RMS along an axis, and the error-to-sigma ratio."""
+def root_by_speed(
+    clips: MotionClips, positions: Floats, velocities: Floats, spreads: Floats
+) -> dict[str, dict[str, float]]:
+    """Return errors of root and velocity by the root's true speed: RMS along an axis, and the error-to-sigma ratio.
+
+    ``positions`` are of the root, (T, C, 3); ``velocities`` and ``spreads`` are of `chain`.
+    """
     true_velocities = np.gradient(clips.positions[:, :, 0], 1 / FPS, axis=0)
     speed = np.linalg.norm(true_velocities, axis=-1)
-    off, drifts = roots.positions - clips.positions[:, :, 0], roots.velocities - true_velocities
+    off, drifts = positions - clips.positions[:, :, 0], velocities - true_velocities
     found: dict[str, dict[str, float]] = {}
     for low, high in pairwise(SPEEDS):
         inside = (speed >= low) & (speed < high) & np.isfinite(off).all(axis=-1)
@@ -155,16 +139,12 @@ def root_by_speed(clips: MotionClips, roots: Roots) -> dict[str, dict[str, float
             continue
         found[f"{low:g}-{high:g}" if np.isfinite(high) else f"above {low:g}"] = {
             "frames": int(inside.sum()),
-            "position_mm": round(1e3 * _rms(off[inside]), 2),
-            "position_ratio": round(_honest(off[inside], roots.spreads[inside, :3]), 3),
-            "velocity_m_s": round(_rms(drifts[inside]), 4),
-            "velocity_ratio": round(_honest(drifts[inside], roots.spreads[inside, 3:]), 3),
+            "position_mm": round(1e3 * rms(off[inside]), 2),
+            "position_ratio": round(_honest(off[inside], spreads[inside, :3]), 3),
+            "velocity_m_s": round(rms(drifts[inside]), 4),
+            "velocity_ratio": round(_honest(drifts[inside], spreads[inside, 3:]), 3),
         }
     return found
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _honest(error: Floats, spread: Floats) -> float:
