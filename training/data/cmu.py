@@ -102,11 +102,8 @@ class Asf:
     """the size of the file's unit"""
 
 
-@dataclass
-class _Bone:
-    offset: NDArray[np.float64]
-    axis: NDArray[np.float64]
-    freedoms: tuple[str, ...]
+_Bone = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
+"""Offset, axis and freedoms, as in `Asf`."""
 
 
 @documented
@@ -125,7 +122,7 @@ def read_asf(text: str) -> Asf:
     if sorted(order) != ["rx", "ry", "rz", "tx", "ty", "tz"]:
         raise MotionError(f"expected a root with six freedoms, found {order}")
     turned = _floats(root.get("orientation", ["0"] * 3))
-    bones = {"root": _Bone(np.zeros(3), _axis(turned, root.get("axis", ["XYZ"])[0]), order)}
+    bones: dict[str, _Bone] = {"root": (np.zeros(3), _axis(turned, root.get("axis", ["XYZ"])[0]), order)}
     bones |= _bones(sections["bonedata"], metres)
 
     joints, parents = ["root"], [-1]
@@ -137,14 +134,8 @@ def read_asf(text: str) -> Asf:
             raise MotionError(f"the hierarchy names a bone not known before it: '{line.strip()}'")
         joints += children
         parents += [joints.index(parent)] * len(children)
-    return Asf(
-        joints=tuple(joints),
-        parents=tuple(parents),
-        offsets=np.array([bones[j].offset for j in joints]),
-        axes=np.array([bones[j].axis for j in joints]),
-        freedoms=tuple(bones[j].freedoms for j in joints),
-        metres=metres,
-    )
+    offsets, axes, freedoms = zip(*(bones[joint] for joint in joints), strict=True)
+    return Asf(tuple(joints), tuple(parents), np.array(offsets), np.array(axes), freedoms, metres)
 
 
 @documented
@@ -219,13 +210,10 @@ def _bones(lines: list[str], metres: float) -> dict[str, _Bone]:
     for block in "\n".join(lines).split("begin")[1:]:
         entry = _entries(block.splitlines())
         try:
-            direction = np.array(_floats(entry["direction"]))
+            offset = np.array(_floats(entry["direction"])) * _floats(entry["length"])[0] * metres
             *degrees, order = entry["axis"]
-            bones[entry["name"][0]] = _Bone(
-                offset=direction * _floats(entry["length"])[0] * metres,
-                axis=_axis(_floats(degrees), order),
-                freedoms=tuple(f.lower() for f in entry.get("dof", [])),
-            )
+            freedoms = tuple(f.lower() for f in entry.get("dof", []))
+            bones[entry["name"][0]] = offset, _axis(_floats(degrees), order), freedoms
         except (KeyError, ValueError, IndexError) as error:
             raise MotionError(f"a bone cannot be read ({error}): '{' '.join(block.split())[:80]}'") from error
     return bones

@@ -250,12 +250,10 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
         "set": np.array([p.weights for p in prepared]),
         "flat": np.array([p.flat for p in prepared]),
         "speed": np.array([p.speed for p in prepared]),
-        **{k: np.array([getattr(p.clip, k) for p in prepared]) for k in _TEXTS},
     }
+    for text in ("name", "source", "licence", "subject", "action"):
+        arrays[text] = np.array([getattr(p.clip, text) for p in prepared])
     save_arrays(path, **arrays)
-
-
-_TEXTS = ("name", "source", "licence", "subject", "action")
 
 
 def save_arrays(path: Path, **arrays: NDArray[Any]) -> None:

@@ -125,17 +125,13 @@ def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, Floats | 
             waiting.append((name, content.decode("ascii", "replace")))
     for done, (name, text) in enumerate(waiting, start=1):
         progress(0.3 + 0.7 * done / len(waiting))
-        motion: Floats | MotionError
+        skeleton = skeletons.get(folder_of(name), MotionError("expected an .asf file in the same folder, found none"))
         try:
-            skeleton = skeletons.get(
-                folder_of(name), MotionError("expected an .asf file in the same folder, found none")
-            )
             if isinstance(skeleton, MotionError):
                 raise skeleton
-            motion = _select(CMU_AMC, skeleton.joints, read_amc(text, skeleton))
+            yield name, _select(CMU_AMC, skeleton.joints, read_amc(text, skeleton))
         except MotionError as error:
-            motion = error
-        yield name, motion
+            yield name, error
 
 
 def folder_of(name: str) -> str:

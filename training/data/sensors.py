@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
+from steadypose.prior.body.skeleton import HIPS, MIRROR, PARENTS, J, limbs
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.corruption import ABSENT, occlude
@@ -38,8 +38,7 @@ _SWINGS = (
     ("knee", "ankle", "foot"),
     ("hip", "knee", "ankle", "foot"),
 )
-_HIPS = [J["left_hip"], J["right_hip"]]
-_LIMBS = [[J[f"{side}_{n}"] for n in names] for side in ("left", "right") for names in (_SWINGS[0], _SWINGS[2])]
+_LIMBS = limbs(_SWINGS[0], _SWINGS[2])
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Sensors:
         # relative to the hips, as monocular networks give joints
         about = np.flatnonzero(rng.random(count) < np.where(kind == KINDS.index("monocular"), 0.8, 0.05))
         for places in (seen, truth):
-            places[about] -= places[about][:, :, _HIPS].mean(axis=2, keepdims=True)
+            places[about] -= places[about][:, :, HIPS].mean(axis=2, keepdims=True)
         for clip in np.flatnonzero(rng.random(count) < TURNED):
             _turn(seen[clip], truth[clip], rng)
         return Sensed(seen, truth, confidence)

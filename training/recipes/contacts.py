@@ -218,7 +218,6 @@ def train_contacts(options: TrainingOptions) -> Path:
 
 
 def _pool(directory: Path, motion: MotionSet, split: str, seed: int) -> Pool:
-    """Return the smoothed clips of a split, computed once."""
     make = partial(smoothed_clips, motion, CLIPS[split], seed + (split == "val"))
     return Pool(**made_once(directory / f"clips-{split}.npz", lambda: vars(make())))
 

@@ -180,10 +180,6 @@ def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, 
     return Scored(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# The scale
-
-
 def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, seed: int) -> Calibration:
     """Calibrate with about ``count`` windows for each condition; if none is fast enough, with all windows."""
     rng = np.random.default_rng(seed)
