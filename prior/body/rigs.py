@@ -21,6 +21,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import INTERPOLATED, NEEDED, Skeleton, middles
 from steadypose.prior.body.mixtures import COLLAR
 from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.npz import MotionError
 
 Mixture = Mapping[str, float]
 
@@ -52,10 +53,6 @@ _ABOVE_HIPS: Floats = REST_POSITIONS[:, 2] - REST_POSITIONS[list(HIPS), 2].mean(
 
 BY_RIG = "steadypose clean --rig FILE (docs/sources.md#motion-capture)"
 """How to describe a file; `info` and `plot`, which refuse it as well, read what `clean` then writes."""
-
-
-class RigError(ValueError):
-    """No body is recognised in a skeleton; the message says what was expected."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +145,7 @@ def recognise(tree: Tree) -> Rig:
     """Recognise the rig of a file's skeleton (see the module). A skeleton with the canonical names is used as it is.
 
     Raises:
-        RigError: there are no two pairs of limbs below a head, or no unit gives the body a person's size.
+        MotionError: there are no two pairs of limbs below a head, or no unit gives the body a person's size.
     """
     pairs = mirror_names(tree.joints)
     legs, arms = _limbs(tree, pairs)
@@ -216,7 +213,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
     neck and head may lie between hips, shoulders and ears. A joint without points stays unobserved.
 
     Raises:
-        RigError: hips or shoulders are missing.
+        MotionError: hips or shoulders are missing.
     """
     table: dict[str, str | dict[str, float]] = {}
     sided: dict[str, str] = {}
@@ -232,7 +229,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
     interpolated = between.keys() & INTERPOLATED - table.keys()
     table = between | table | {joint: name for joint, name in sided.items() if joint in JOINTS}
     if missing := [joint for joint in NEEDED if joint not in table]:
-        raise RigError(
+        raise MotionError(
             f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with {BY_RIG} which"
         )
     ordered = {joint: table[joint] for joint in JOINTS if joint in table}
@@ -252,7 +249,7 @@ def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
             longest[path[first]] = max(longest.get(path[first], limb), limb, key=lambda other: other.length)
     limbs = sorted(longest.values(), key=lambda limb: -limb.length)[:2]
     if len(limbs) < 2:
-        raise RigError(
+        raise MotionError(
             "expected a body: legs and arms of two bones each, in names that differ by left and right alone; "
             f"got {', '.join(tree.joints[:8])}...; say with {BY_RIG} which joints are which"
         )
@@ -268,7 +265,7 @@ def _spine(tree: Tree, legs: _Limb, arms: _Limb, pairs: Mapping[str, str]) -> _S
         way for way in ways if way[: len(trunk)] == trunk != way and sided.isdisjoint(tree.joints[j] for j in way)
     ]
     if not upwards:
-        raise RigError(f"expected neck and head above '{tree.joints[arms.trunk]}', found neither; say with {BY_RIG}")
+        raise MotionError(f"expected neck and head above '{tree.joints[arms.trunk]}', found neither; say with {BY_RIG}")
     named = [way for way in upwards if "head" in tree.joints[way[-1]].lower()]
     way = min(named, key=len) if named else max(upwards, key=len)
     base = max(k for k, (a, b) in enumerate(zip(way, tree.path(legs.trunk), strict=False)) if a == b)
@@ -302,7 +299,7 @@ def _metres(size: float) -> float:
     times = {unit: size * unit / person for unit in UNITS.values()}
     unit = min(times, key=lambda unit: abs(np.log(max(times[unit], 1e-9))))
     if not SHORTEST < times[unit] < TALLEST:
-        raise RigError(
+        raise MotionError(
             f"expected a body of 0.95 to 2.3 m in {', '.join(UNITS)}; got one whose leg and trunk are {size:.4g} long: "
             f"say with {BY_RIG} how many metres that is"
         )

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
-from steadypose.prior.body.rigs import RigError
 from steadypose.prior.npz import MotionError
 
 Y_UP_TO_Z_UP: NDArray[np.float64] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -34,8 +33,6 @@ def documented(read: Callable[P, R]) -> Callable[P, R]:
             return read(*args, **kwargs)
         except MotionError:
             raise
-        except RigError as error:  # its text says what to do
-            raise MotionError(str(error)) from error
         except Exception as error:
             raise MotionError(f"cannot be read: {type(error).__name__}: {error}") from error
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.rigs import BY_RIG, Rig, RigError, Tree, recognise, recognise_points, up_axis
+from steadypose.prior.body.rigs import BY_RIG, Rig, Tree, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forward
@@ -102,12 +102,12 @@ def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, des
     """Return the rig of a file: as described, from a table, or recognised.
 
     Raises:
-        RigError: a described joint is missing, or no body is recognised.
+        MotionError: a described joint is missing, or no body is recognised.
     """
     if description.canonical:
         named = _described(joints, description.canonical)
         if not description.metres:
-            raise RigError("rig: expected metres, the size of the file's unit, beside [canonical]")
+            raise MotionError("rig: expected metres, the size of the file's unit, beside [canonical]")
         return Rig(named, description.metres)
     if set(CMU_BVH.skeleton.joints) <= set(joints):
         return CMU_BVH
@@ -117,7 +117,7 @@ def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, des
 def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str]]) -> Skeleton:
     sources = {joint: [given] if isinstance(given, str) else list(given) for joint, given in canonical.items()}
     if missing := [n for names in sources.values() for n in names if n not in joints]:
-        raise RigError(f"rig [canonical]: expected names of joints, the file has no {', '.join(missing)}")
+        raise MotionError(f"rig [canonical]: expected names of joints, the file has no {', '.join(missing)}")
     return Skeleton("described", tuple(joints), {joint: dict.fromkeys(names, 1.0) for joint, names in sources.items()})
 
 

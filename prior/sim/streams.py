@@ -59,14 +59,12 @@ def read_manifest(path: Path) -> dict[str, Stream]:
         ManifestError: the file is missing, is not JSON, or an entry has an unknown key, script or value.
     """
     try:
-        entries = json.loads(path.read_text())["streams"]
-        return {name: _stream(name, entry, path.parent) for name, entry in entries.items()}
+        entries = json.loads(path.read_text())["streams"].items()
     except OSError as error:
         raise ManifestError(f"cannot read {path}: {error.strerror}") from error
-    except ManifestError:
-        raise
     except (KeyError, AttributeError, TypeError, ValueError) as error:
         raise ManifestError(f"{path}: expected JSON with an object 'streams', got {error!r}") from error
+    return {name: _stream(name, entry, path.parent) for name, entry in entries}
 
 
 def _stream(name: str, entry: Mapping[str, Any], folder: Path) -> Stream:

@@ -13,7 +13,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import CANONICAL, Skeleton, to_canonical
-from steadypose.prior.body.rigs import Rig, RigError, up_axis
+from steadypose.prior.body.rigs import Rig, up_axis
 from steadypose.prior.mocap.bvh import Bvh, read_bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
 from steadypose.prior.mocap.files import SUFFIXES, UNDESCRIBED, Description, file_rig, read_motion
@@ -80,10 +80,7 @@ def bvh_motion(text: str) -> tuple[Bvh, Skeleton, Floats]:
         MotionError: it cannot be read, or no body is recognised in it.
     """
     bvh = read_bvh(text)
-    try:
-        rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, UNDESCRIBED)
-    except RigError as error:
-        raise MotionError(str(error)) from error
+    rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, UNDESCRIBED)
     positions = _select(rig, bvh.joints, bvh.positions(rig.lost_bones))
     return bvh, rig.skeleton, positions[_rest_frames(positions, bvh.fps) :]
 

@@ -9,7 +9,7 @@ from tests.helpers.bvh_writer import Joint, write_bvh
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.prior.body.rigs import UNITS, RigError, Tree, mirror_names, recognise, recognise_points, up_axis
+from steadypose.prior.body.rigs import UNITS, Tree, mirror_names, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_POSITIONS, J
 from steadypose.prior.mocap.bvh import read_bvh
 from steadypose.prior.mocap.clip import MotionError
@@ -281,10 +281,10 @@ def as_tree(joints: Sequence[Joint]) -> Tree:
 
 def test_what_is_no_body_is_refused_in_words() -> None:
     snake = [Joint(f"bone{k}", f"bone{k - 1}" if k else None, np.array([0.0, 10.0 * k, 0.0])) for k in range(12)]
-    with pytest.raises(RigError, match="legs and arms"):
+    with pytest.raises(MotionError, match="legs and arms"):
         recognise(as_tree(snake))
     headless = [j for j in FAMILIES["LAFAN1"].joints() if j.name not in ("Neck", "Head")]
-    with pytest.raises(RigError, match="neck and head above 'Spine2'"):
+    with pytest.raises(MotionError, match="neck and head above 'Spine2'"):
         recognise(as_tree(headless))
 
 
