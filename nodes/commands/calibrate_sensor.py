@@ -81,7 +81,7 @@ class CalibrateSensor:
 
         set_threads(1)  # of so small a network two are slower
         people = len({take.person for take in takes})
-        print(f"{plural(len(takes), 'recording', 'recordings')} of {plural(people, 'person', 'people')}")
+        print(f"{plural(len(takes), 'recording')} of {plural(people, 'person', 'people')}")
         with tempfile.TemporaryDirectory() as folder:
             try:
                 options = TrainingOptions(self.recording, Path(folder), self.name, self.iterations)

@@ -20,7 +20,7 @@ from steadypose.nodes.commands.output import (
     clean_recording,
     console,
     plural,
-    print_refused,
+    print_faults,
 )
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
@@ -111,10 +111,8 @@ def clean(
             advanced=lambda: progress.advance(bar),
         )
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
-    terminal.print(f"{out}: {plural(done.frames, 'frame', 'frames')}, {spent}")
-    print_refused(terminal, done.refused)
-    for problem in done.problems:
-        terminal.print(f"  {problem}", style="yellow")
+    terminal.print(f"{out}: {plural(done.frames, 'frame')}, {spent}")
+    print_faults(terminal, done.refused, done.problems)
     if not done.poses:
         terminal.print(f"  {NO_POSE}; `steadypose info {source}` shows what it contains", style="red")
     elif not done.trusted:

@@ -14,7 +14,7 @@ from steadypose.nodes.commands.output import (
     check_poses_file,
     console,
     plural,
-    print_refused,
+    print_faults,
     write_output,
 )
 from steadypose.nodes.graph.launch import read_toml
@@ -111,21 +111,17 @@ def complete(
     people = len({stretch.body for stretch, _ in completion.done})
     longest = max(done.span for _, done in completion.done) / FPS
     terminal.print(
-        f"{out}: {plural(len(completion.clean) - 1, 'frame', 'frames')} of {plural(people, 'body', 'bodies')}; "
+        f"{out}: {plural(len(completion.clean) - 1, 'frame')} of {plural(people, 'body', 'bodies')}; "
         f"{completion.given:.0%} of their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
     if completion.unreached:
-        terminal.print(
-            f"  left unknown, too far from any observation: {plural(completion.unreached, 'joint', 'joints')}",
-            style="yellow",
-        )
+        unreached = plural(completion.unreached, "joint")
+        terminal.print(f"  left unknown, too far from any observation: {unreached}", style="yellow")
     for body in completion.centred:
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for other in alternatives.values():
         terminal.print(f"  wrote an alternative: {other}")
-    print_refused(terminal, completed.refused)
-    for problem in completed.problems:
-        terminal.print(f"  {problem}", style="yellow")
+    print_faults(terminal, completed.refused, completed.problems)
     if picture is not None:
         save(draw_completion(completion, source.name), picture)
         terminal.print(f"wrote {picture}")

@@ -20,6 +20,7 @@ from steadypose.nodes.commands.output import (
     check_file,
     console,
     plural,
+    print_faults,
     unfinished,
 )
 from steadypose.nodes.driving import OfflineRun
@@ -91,7 +92,7 @@ def export(
         content = {".csv": to_csv, ".trc": to_trc}[out.suffix](motion)
     with unfinished(out) as part:
         part.write_bytes(content)
-    console().print(f"{out}: {plural(len(motion.root), 'frame', 'frames')} at {motion.fps:g} Hz")
+    console().print(f"{out}: {plural(len(motion.root), 'frame')} at {motion.fps:g} Hz")
     return 0
 
 
@@ -138,28 +139,24 @@ def retarget(
         if not separator:
             raise LaunchError(f"--link: expected PART=LINK, such as left_foot=l_sole, got {link!r}")
         given[part] = name
-    frames = open_recording(source)
-    run = OfflineRun(frames, {"prior": {}, "trajectory": {}})
+    recording = open_recording(source)
+    run = OfflineRun(recording, {"prior": {}, "trajectory": {}})
     robot = load_robot(urdf, given)
     follower = Follower(Retargeter(robot, sole), body)
     poses = []
     terminal = console()
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
-        bar = progress.add_task(source.name, total=len(frames))
+        bar = progress.add_task(source.name, total=len(recording))
         for topic, message in run:
             progress.update(bar, completed=run.diagnosis.frames)
             # a simulated recording also has its truth, as PoseWorld
             world = message if topic == POSE_WORLD and isinstance(message, PoseWorld) else None
             if world and (pose := follower.process(world)) is not None:
                 poses.append(pose)
-    for problem in run.diagnosis.texts:
-        terminal.print(f"  {problem}", style="yellow")
+    print_faults(terminal, {}, run.diagnosis.texts)
     if not poses:
-        whom = "nobody" if body is None else f"no body {body}"
-        raise LaunchError(
-            f"{source}: {whom} to follow in {plural(run.diagnosis.frames, 'frame', 'frames')}; `steadypose info "
-            f"{source}` says who is there"
-        )
+        whom, frames = "nobody" if body is None else f"no body {body}", plural(run.diagnosis.frames, "frame")
+        raise LaunchError(f"{source}: {whom} to follow in {frames}; `steadypose info {source}` says who is there")
     stamp_ns, root, joints, stands = (np.array(column) for column in zip(*poses, strict=True))
     with unfinished(out) as part:
         if out.suffix == ".npz":
@@ -169,7 +166,7 @@ def retarget(
         else:
             table = np.column_stack([(stamp_ns - stamp_ns[0]) / 1e9, root, joints])
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")
-    print(f"{out}: {plural(len(poses), 'frame', 'frames')} of {len(robot.joints)} joints")
+    print(f"{out}: {plural(len(poses), 'frame')} of {len(robot.joints)} joints")
     if not run.diagnosis.trusted:
         terminal.print(f"  {UNTRUSTED}", style="red")
     return 0 if run.diagnosis.trusted else 1

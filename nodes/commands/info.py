@@ -67,8 +67,7 @@ def info(
         with subscribe(target, launch, (endpoint,)) as subscriber:
             contents = _listen(subscriber)
         published |= bool(contents.messages)
-        messages = plural(contents.messages, "message", "messages")
-        print(f"  {endpoint}: {messages} in {INFO_S:g} s{Rate(contents.times).brief}")
+        print(f"  {endpoint}: {plural(contents.messages, 'message')} in {INFO_S:g} s{Rate(contents.times).brief}")
         if contents.messages:
             print(f"    {contents}")
     if not published:
@@ -98,7 +97,7 @@ class _Contents:
         if isinstance(message, PoseRaw):
             self._note("skeleton", message.skeleton)
         if isinstance(message, PoseClean):
-            self._note("delay", plural(message.delay_frames, "frame", "frames"))
+            self._note("delay", plural(message.delay_frames, "frame"))
         if isinstance(message, PoseEvents):
             self._bodies.update(event.body for event in message.events)
         else:
@@ -129,15 +128,14 @@ def _describe_recording(path: Path) -> Iterator[str]:
         if not recording.complete:
             yield "cut short: the writer was killed or the file truncated; what follows could be read"
         if recording.lost_bytes:
-            where = plural(recording.gaps, "place", "places")
+            where = plural(recording.gaps, "place")
             yield f"damaged: {recording.lost_bytes} bytes in {where} cannot be read; `steadypose repair` saves the rest"
         for topic in recording.topics:
-            messages = plural(contents[topic].messages, "message", "messages")
             yield f"{topic}: {wire_type(TOPICS[topic])}"
-            yield f"    {messages}{Rate(contents[topic].times).brief}"
+            yield f"    {plural(contents[topic].messages, 'message')}{Rate(contents[topic].times).brief}"
             yield f"    {contents[topic]}"
         for topic, count in recording.refused.items():
-            yield f"{topic}: {plural(count, 'message', 'messages')} that cannot be decoded"
+            yield f"{topic}: {plural(count, 'message')} that cannot be decoded"
 
 
 def _listen(subscriber: Subscriber) -> _Contents:
@@ -185,8 +183,7 @@ def describe_file(path: Path) -> Iterator[str]:
                     seen.append(there.mean())
     rate = Rate(stamps)
     share = f"{np.mean(seen):.0%} of their joints observed" if seen else "nobody in any frame"
-    count = plural(rate.count, "frame", "frames")
-    yield f"{count}{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
+    yield f"{plural(rate.count, 'frame')}{rate.brief}, {stamps[-1] - stamps[0]:.2f} s; skeleton {', '.join(skeletons)}"
     yield f"body ids {', '.join(map(str, sorted(ids))) or 'none'}; {share}"
     for cause, number in source.refused.items():
         yield f"refused, {cause}: {number}"

@@ -132,7 +132,7 @@ def _lines(topic: str, message: Message) -> Iterator[str]:
         return
     end = "  end of stream" if message.end_of_stream else ""
     if isinstance(message, PoseEvents):
-        yield f"{stamp}  {message.source}  {plural(len(message.events), 'event', 'events')}{end}"
+        yield f"{stamp}  {message.source}  {plural(len(message.events), 'event')}{end}"
         for event in message.events:
             hand = f"{event.hand.name.lower()} " if event.hand else ""
             what = f"{hand}{event.kind.name.lower()} {event.phase.name.lower()}"

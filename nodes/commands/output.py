@@ -46,11 +46,13 @@ OTHER_FORMATS = {
 """endings that are never meant as a recording's name, which is that of a folder"""
 
 
-def print_refused(terminal: Console, refused: Mapping[str, int]) -> None:
-    """Print in one line what was not used as given, by cause."""
+def print_faults(terminal: Console, refused: Mapping[str, int], problems: Iterable[str]) -> None:
+    """Print in one line what was not used as given, by cause, and then each problem."""
     if refused:
         counts = ", ".join(f"{cause.replace('_', ' ')} ({count})" for cause, count in refused.items())
         terminal.print(f"  not used as given: {counts}")
+    for problem in problems:
+        terminal.print(f"  {problem}", style="yellow")
 
 
 def check_output(source: Path, *outputs: Path) -> None:
@@ -157,8 +159,9 @@ def console() -> Console:
     return Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
 
-def plural(count: int, one: str, more: str) -> str:
-    return f"{count} {one if count == 1 else more}"
+def plural(count: int, one: str, more: str = "") -> str:
+    """A number of things; ``more`` is their plural if it does not end in s."""
+    return f"{count} {one if count == 1 else more or one + 's'}"
 
 
 @dataclass(frozen=True)

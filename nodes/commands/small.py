@@ -56,9 +56,9 @@ def repair(source: In, out: Out) -> int:
             writer.write(topic, message, stamp_ns)
             saved += 1
         undecodable = recording.refused.total()
-        lost = f"{recording.lost_bytes} bytes in {plural(recording.gaps, 'place', 'places')}"
-        print(f"{out}: {plural(saved, 'message', 'messages')}; lost: {lost}", end="")
-        print(f", {plural(undecodable, 'message', 'messages')} that cannot be decoded" if undecodable else "")
+        lost = f"{recording.lost_bytes} bytes in {plural(recording.gaps, 'place')}"
+        print(f"{out}: {plural(saved, 'message')}; lost: {lost}", end="")
+        print(f", {plural(undecodable, 'message')} that cannot be decoded" if undecodable else "")
         return 1 if recording.lost_bytes or undecodable else 0
 
 
@@ -138,7 +138,7 @@ def plot(
                 frames = write_overlay(recording, over, part, body)
             else:
                 frames = write_video(history_of_path(recording), part, body)
-        print(f"wrote {video}: {plural(frames, 'frame', 'frames')}")
+        print(f"wrote {video}: {plural(frames, 'frame')}")
         return
     output = output or Path(f"{recording.resolve().stem}.png")
     check_picture(output)
