@@ -22,7 +22,6 @@ from typing import Annotated, Any, get_type_hints
 from steadypose.nodes.extras import extra_of, how_to_install, install_command, upgrade_and_uninstall
 from steadypose.prior.settings import nearest
 
-EVALUATE = "steadypose.benchmarks.evaluate"
 COMMANDS = {
     "run": ("run", "clean poses live, from a camera, a tracker or a recording"),
     "node": ("node", "run one node of `run`, for another machine or a supervisor"),
@@ -38,7 +37,7 @@ COMMANDS = {
     "plot": ("small", "plot a recording as an image or a video"),
     "prepare": ("prepare", "convert motion capture to training data"),
     "train": ("train", "train a model of the prior"),
-    "evaluate": (EVALUATE, "measure accuracy and speed beside tuned baselines"),
+    "evaluate": ("steadypose.benchmarks.evaluate", "measure accuracy and speed beside tuned baselines"),
     "simulate": ("small", "simulate recordings of a depth camera, with ground truth"),
     "calibrate": ("calibrate", "calibrate a camera's lens and pose, or a sensor's own error"),
     "doctor": ("doctor", "check this machine: what is missing, and how to get it"),

@@ -26,8 +26,6 @@ def launch_errors() -> Iterator[None]:
     """Raise invalid settings and missing weights as `LaunchError`."""
     try:
         yield
-    except LaunchError:
-        raise
     except (ValueError, FileNotFoundError) as error:
         raise LaunchError(str(error)) from error
 

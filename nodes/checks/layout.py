@@ -43,14 +43,15 @@ def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterat
     if len(messages) < ENOUGH:
         return
     newest = messages[-1]
+    counts = Counter(len(body.positions) for body in bodies(messages)).most_common(1)
+    count = counts[0][0] if counts else 0
     if newest.skeleton not in SKELETONS:
-        yield _unknown(messages)
+        yield _unknown(messages, count)
         return
     yield from check_sensor_pose(newest.sensor_pose)
     skeleton = SKELETONS[newest.skeleton]
-    counts = Counter(len(body.positions) for body in bodies(messages))
-    if counts and (common := counts.most_common(1)[0][0]) != len(skeleton.joints):
-        yield _wrong_count(messages, skeleton, common)
+    if counts and count != len(skeleton.joints):
+        yield _wrong_count(messages, skeleton, count)
         return
     few = some_bodies(messages)
     yield from _confidence(few, settings.gate.min_confidence)
@@ -58,10 +59,10 @@ def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterat
     yield from _ids(messages, settings.max_bodies, settings.identify.enabled)
 
 
-def _unknown(messages: Sequence[PoseRaw]) -> Problem:
+def _unknown(messages: Sequence[PoseRaw], count: int) -> Problem:
     name = messages[-1].skeleton
-    like = _best(messages)
-    hint = f"; its {like[1]} joints are most like {like[0]!r}" if like else ""
+    like = _best(messages, count)
+    hint = f"; its {count} joints are most like {like!r}" if like else ""
     return error(
         "unknown_skeleton",
         f"skeleton {name!r}{_named_like(name)}{hint}: expected one of {', '.join(SKELETONS)}; for a layout of your "
@@ -71,9 +72,8 @@ def _unknown(messages: Sequence[PoseRaw]) -> Problem:
 
 def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) -> Problem:
     same = [s.name for s in SKELETONS.values() if len(s.joints) == count]
-    like = _best(messages)
-    if like:
-        hint = f"; these are most like {like[0]!r}: use that name"
+    if like := _best(messages, count):
+        hint = f"; these are most like {like!r}: use that name"
     elif same:
         hint = f"; {' and '.join(same)} have {count}"
     else:
@@ -83,15 +83,13 @@ def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) ->
     )
 
 
-def _best(messages: Sequence[PoseRaw]) -> tuple[str, int] | None:
-    """The layout under which the joints fit a body best, and its number of joints."""
-    counts = Counter(len(body.positions) for body in bodies(messages))
-    if not counts:
+def _best(messages: Sequence[PoseRaw], count: int) -> str | None:
+    """The layout under which bodies of ``count`` joints fit a body best."""
+    if not count:
         return None
-    count = counts.most_common(1)[0][0]
     joints = np.array([body.positions for body in bodies(messages) if len(body.positions) == count], np.float64)
     best = next(iter(likenesses(np.where(np.isfinite(joints), joints, np.nan))), None)
-    return (best.skeleton, count) if best and best.is_body else None
+    return best.skeleton if best and best.is_body else None
 
 
 def check_sensor_pose(pose: Pose) -> Iterator[Problem]:

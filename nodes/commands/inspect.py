@@ -40,13 +40,13 @@ Address = Annotated[tuple[str, ...], tyro.conf.arg(name="endpoint", metavar="ADD
 
 
 def messages_of(
-    target: str, topics: tuple[str, ...], launch: str | None, endpoints: tuple[str, ...], *, newest: bool = False
+    target: str, topics: tuple[str, ...], launch: str | None, endpoints: tuple[str, ...]
 ) -> Iterator[tuple[str, Message]]:
-    """What comes on a topic until Ctrl-C, if ``newest`` without what could not be taken in time; or a recording's."""
+    """What comes on a topic until Ctrl-C, without what could not be taken in time; or a recording's."""
     if target in TOPICS:
         if topics:
             raise LaunchError(f"--topic chooses from a recording; {target} is a topic itself")
-        with subscribe(target, launch, endpoints, conflate=newest) as subscriber:
+        with subscribe(target, launch, endpoints, conflate=True) as subscriber:
             yield from receive(subscriber, target)
         return
     for topic in topics:
@@ -116,7 +116,7 @@ def echo(
         endpoints: address to listen at. Repeatable.
     """
     left = sys.maxsize if count is None else count
-    for topic, message in messages_of(target, topics, launch, endpoints, newest=True):
+    for topic, message in messages_of(target, topics, launch, endpoints):
         lines = ["---", f"topic: {topic}", *_fields(message, "")] if full else _lines(topic, message)
         print("\n".join(map(printable, lines)), flush=target in TOPICS)
         left -= 1
