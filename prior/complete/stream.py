@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.types import CleanBody, JointState, PoseClean, PoseRaw
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
-from steadypose.prior.body.kinematics import (
-    CONTACT_JOINTS,
-    REST_HEIGHT,
-    heading,
-    quaternions,
-    rotation_matrix,
-    yaw_matrix,
-)
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, SensorFrame, heading, quaternions, yaw_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
 from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
@@ -142,14 +135,14 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
                 f"{source}: skeleton {message.skeleton!r} is not known: expected one of {', '.join(SKELETONS)}, or one "
                 "of your own by --skeletons"
             )
-        turn, place = rotation_matrix(message.sensor_pose.orientation), message.sensor_pose.position
+        sensor = SensorFrame.of(message.sensor_pose)
         for body in message.bodies:
             observed = np.where((body.confidence > 0)[:, None], body.positions, np.nan).astype(np.float64)
             joints, _ = to_canonical(SKELETONS[message.skeleton], observed, body.confidence)
             newer = not stamps[body.id] or message.stamp_ns > stamps[body.id][-1]
             if newer and finite_joints(joints).any():
                 stamps[body.id].append(message.stamp_ns)
-                positions[body.id].append(joints @ turn.T + place)
+                positions[body.id].append(sensor.to_world(joints))
     found = [
         stretch
         for body in stamps
@@ -216,15 +209,14 @@ def _clean_messages(
         lengths = np.linalg.norm(stretch.offsets, axis=-1) * (np.array(PARENTS) >= 0)
         for row in np.flatnonzero(finite_joints(completed.positions).all(axis=1)):
             frame = stretch.first + int(row)
-            pose = context(frame).sensor_pose
-            turn = rotation_matrix(pose.orientation)
+            sensor = SensorFrame.of(context(frame).sensor_pose)
             rotations = completed.rotations[row].copy()
-            rotations[0] = turn.T @ rotations[0]
+            rotations[0] = sensor.rotation.T @ rotations[0]
             known = completed.known[row]
             bodies[frame].append(
                 CleanBody(
                     id=stretch.body,
-                    positions=(completed.positions[row] - pose.position) @ turn,
+                    positions=sensor.from_world(completed.positions[row]),
                     rotations=quaternions(rotations),
                     state=np.where(known, JointState.SEEN, JointState.IMPUTED),
                     sigma=sigma[row],
@@ -232,7 +224,7 @@ def _clean_messages(
                     anomaly_flag=False,
                     joint_anomaly=np.full(22, np.nan),
                     bone_lengths=lengths,
-                    raw_positions=(stretch.given[row] - pose.position) @ turn,
+                    raw_positions=sensor.from_world(stretch.given[row]),
                     raw_confidence=known.astype(np.float32),
                 )
             )
@@ -245,9 +237,7 @@ def _clean_messages(
                 bodies[frame],
             )
         )  # fmt: skip
-    last = messages[-1]
-    end = PoseClean(last.stamp_ns, last.frame_id, last.source, last.sensor_pose, last.calibrated, 0, [], True)
-    return [*messages, end]
+    return [*messages, replace(messages[-1], bodies=[], end_of_stream=True)]
 
 
 def along_paths(completion: Completion, weights: str) -> list[PoseClean]:
@@ -266,10 +256,10 @@ def along_paths(completion: Completion, weights: str) -> list[PoseClean]:
             steps |= {(stretch.body, first_ns + row * PERIOD_NS): step for row, step in enumerate(path)}
     moved = []
     for message in completion.clean:
-        turn = rotation_matrix(message.sensor_pose.orientation)
+        sensor = SensorFrame.of(message.sensor_pose)
         bodies = [
             body if (step := steps.get((body.id, message.stamp_ns))) is None
-            else replace(body, positions=body.positions + turn.T @ step)
+            else replace(body, positions=body.positions + sensor.rotation.T @ step)
             for body in message.bodies
         ]  # fmt: skip
         moved.append(replace(message, bodies=bodies))
