@@ -155,8 +155,6 @@ def test_what_a_body_scores_all_the_time_is_no_fault_and_a_fault_of_a_second_no_
     assert (scale.update(slots, told[0]) <= before + 0.45).all()
     scale.update(slots, np.full(3, np.nan))
     assert np.isfinite(scale.update(slots, told[0])).all(), "one window without a score spoils none of the next"
-    scale.forget(np.array([False, True, False]))
-    assert scale.update(slots, told[0])[1] == 1.0
 
 
 def test_switched_off_nothing_is_scored() -> None:

@@ -58,15 +58,6 @@ def test_a_rig_with_other_bones_is_not_at_fault() -> None:
     assert error.bias_sigma[0] < 0.001
 
 
-def test_a_body_that_leaves_is_forgotten() -> None:
-    estimator = BiasEstimator(0.02, 1)
-    for frame in waving(30):
-        estimator.update(Smoothed(0.0, frame[None], np.full((1, 22), 0.001)), BONES, np.zeros(1))
-    estimator.forget(np.array([True]))
-    nothing = Smoothed(0.0, np.full((1, 22, 3), np.nan), np.full((1, 22), np.inf))
-    assert estimator.update(nothing, BONES, np.array([0.02])).bias_sigma[0] == pytest.approx(0.02)
-
-
 def test_lengths_are_those_observed_as_soon_as_they_are_known() -> None:
     generic = np.linalg.norm(BONES.offsets[0], axis=-1)
     nothing = found(np.full((1, 22, 3), np.nan), sigma=0.01, jitter=0.0)
@@ -113,21 +104,6 @@ def test_in_a_crowd_everybodys_bones_are_renewed_as_often_as_those_of_one_of_eig
     assert renewals(8).min() == renewals(64).min() > 12
 
 
-def test_who_comes_after_somebody_else_has_generic_bones() -> None:
-    stage, both = PersonEstimator(PersonSettings(), 2), np.array([True, True])
-    before = stage.current
-    for frame in waving(60, 0.85):
-        before = stage.update(Smoothed(0.0, np.tile(frame, (2, 1, 1)), np.full((2, 22), 0.02)), np.full(2, BIAS), both)
-    stage.forget(np.array([True, False]))
-    for own, generic, kept in zip(
-        vars(stage.current).values(), vars(Person.generic(2)).values(), vars(before).values(), strict=True
-    ):
-        np.testing.assert_array_equal(own[0], generic[0])
-        np.testing.assert_array_equal(own[1], kept[1])
-    assert before.measured.all()
-    assert before.length_variance.min(axis=0)[1:].all()
-
-
 FRAMES, SIGMA, DEPTH = 300, 0.01, 0.04
 KEPT = np.exp(-1 / (0.5 * FPS))
 TURNED = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
@@ -166,13 +142,11 @@ def test_nothing_is_left_out_of_white_noise() -> None:
     assert left_out(seen, white=0.75) == pytest.approx(0.5 * left_out(seen))
 
 
-def test_hidden_joints_and_a_forgotten_body_count_for_nothing() -> None:
-    seen, estimator = waving(FRAMES) + noise(DEPTH), DepthError(1)
-    whole = left_out(seen, estimator=estimator)
+def test_hidden_joints_count_for_nothing() -> None:
+    seen = waving(FRAMES) + noise(DEPTH)
+    whole = left_out(seen)
     seen[::2, 18:] = np.nan
     assert 0.5 * whole < left_out(seen) < 1.5 * whole
-    estimator.forget(np.array([True]))
-    assert left_out(seen[:1], estimator=estimator) == 0.0
     assert DepthError(2).update(None, np.zeros(2)).tolist() == [0.0, 0.0]
 
 

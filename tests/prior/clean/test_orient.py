@@ -1,14 +1,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tests.helpers.bodies import noisy, stream, waving
+from tests.helpers.bodies import noisy, waving
 from tests.helpers.values import clean_bodies
 
 from steadypose.msgs.types import CleanBody
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations, heading, rotation_matrices, rotation_matrix
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS
-from steadypose.prior.clean.pipeline import PriorPipeline
-from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.sim.noise import time_correlated
 
 FRAMES, SETTLED = 45, 20
@@ -54,10 +52,3 @@ def test_with_noise_the_root_is_nearer_the_true_one_and_turns_less() -> None:
     mine, plain = (_root(_bodies(truth + noise, on)) for on in (True, False))
     assert np.median((mine.inv() * true).magnitude()) < 0.7 * np.median((plain.inv() * true).magnitude())
     assert (mine[:-1].inv() * mine[1:]).magnitude().mean() < (plain[:-1].inv() * plain[1:]).magnitude().mean()
-
-
-def test_a_body_begins_anew_without_the_twist_of_the_one_before() -> None:
-    pipeline, messages = PriorPipeline(PriorSettings()), stream(noisy(FRAMES, 0.02))
-    runs = [[c for m in messages for c in pipeline.process(m)] + pipeline.flush() for _ in range(2)]
-    for first, second in zip(*runs, strict=True):
-        np.testing.assert_array_equal(first.bodies[0].rotations, second.bodies[0].rotations)

@@ -10,13 +10,14 @@ from tests.helpers.bodies import PERIOD_NS, noisy, raw, stream, waving
 from tests.helpers.values import clean, observation
 
 from steadypose.msgs.codec import encode
-from steadypose.msgs.types import JointState, Pose, PoseClean
+from steadypose.msgs.types import CleanBody, JointState, Pose, PoseClean
 from steadypose.prior.body.kinematics import forward_kinematics, yaw_matrix
 from steadypose.prior.body.layouts import INTERPOLATED_SIGMA, SKELETONS
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.clean import core
 from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
 from steadypose.prior.clean.settings import PriorSettings
+from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
 
 
@@ -216,6 +217,35 @@ def test_a_body_that_leaves_is_dropped_and_its_place_is_free() -> None:
     assert pipeline.counters["too_many_bodies"] == 0
     first = next(c for c in cleaned if any(b.id == 3 for b in c.bodies))
     assert np.allclose(next(b for b in first.bodies if b.id == 3).positions, p[30] + [1, 1, 0], atol=0.05)
+
+
+@pytest.mark.parametrize("delay", [0, 4])
+def test_who_comes_into_the_place_of_another_is_answered_as_if_that_one_had_never_been(delay: int) -> None:
+    """To the bit, in all stages, and so is who stays. The one before was in lasting noise, hidden, frozen, mirrored."""
+    rng, arm = np.random.default_rng(0), [J["left_elbow"], J["left_wrist"]]
+    other, person = waving(60, scale=0.8) + [3.0, 0.0, 0.0], waving(45, scale=1.1) + [3.0, 0.0, 0.0]
+    other += time_correlated(rng.normal(0.0, 0.04, other.shape), 0.95) * [1.0, 0.2, 0.2]
+    other[50:, arm, 0] -= 2 * (other[50:, arm, 0] - other[50:, [J["left_shoulder"]], 0])
+    other[40:, J["left_foot"]] = other[40, J["left_foot"]]
+    person += rng.normal(0.0, 0.004, person.shape)
+    other[30:, J["right_wrist"]] = person[:, [J["right_knee"], J["right_ankle"]]] = person[30:40, arm] = np.nan
+    stays = waving(125) + rng.normal(0.0, 0.01, (125, 22, 3))
+
+    def answers(before: list[dict[int, np.ndarray]]) -> dict[int, list[CleanBody]]:
+        people = [*before, *[{}] * 20, *({2: frame} for frame in person)]
+        messages = [raw(10**18 + k * PERIOD_NS, {7: stays[k], **others}) for k, others in enumerate(people)]
+        every = {"correct": {"sensor": "kinect_v2"}, "refine": {"enabled": True}}
+        cleaned, _ = clean(messages, delay=delay, max_bodies=2, **every)
+        return {i: [b for c in cleaned for b in c.bodies if b.id == i] for i in (2, 7)}
+
+    got, expected = answers([{1: frame} for frame in other]), answers([{}] * 60)
+    np.testing.assert_equal(
+        [dataclasses.asdict(body) for body in got[2]], [dataclasses.asdict(body) for body in expected[2]]
+    )
+    for a, b in zip(got[7], expected[7], strict=True):
+        assert np.allclose([*a.positions.T, a.sigma], [*b.positions.T, b.sigma], atol=1e-4)
+        assert np.allclose(a.joint_anomaly, b.joint_anomaly, atol=1e-2, equal_nan=True)
+    assert len(got[2]) == len(person)
 
 
 @pytest.mark.parametrize(("gap", "refused"), [(1, 6), (6, 1), (10, 0)])

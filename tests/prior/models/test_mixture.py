@@ -243,19 +243,6 @@ def test_bodies_do_not_touch_each_other_and_the_same_gives_the_same() -> None:
     assert (places(smoothed(seen, 4)) == places(together)).all()
 
 
-def test_a_slot_forgotten_starts_afresh() -> None:
-    first, second = noisy(walk(60, 2)), noisy(walk(60, 2) + 1.0)
-    smoother = MixtureSmoother(0, 2)
-    for t, frame in enumerate(first):
-        smoother.update(frame, t / FPS)
-    smoother.forget(np.array([True, False]))
-    found = [smoother.update(frame, (60 + t) / FPS) for t, frame in enumerate(second)]
-    fresh = smoothed(second, 0)
-    for a, b in zip(found, fresh, strict=True):
-        assert a is not None
-        np.testing.assert_allclose(a.positions[0], b.positions[0], atol=1e-12)
-
-
 def test_every_frame_is_answered_once_with_its_stamp() -> None:
     found = smoothed(walk(20), 4)
     np.testing.assert_allclose([one.stamp_s for one in found], np.arange(20) / FPS)

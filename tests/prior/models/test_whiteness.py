@@ -72,11 +72,7 @@ def test_missing_joints_and_a_forgotten_body_count_for_nothing() -> None:
     for frame in seen:
         whiteness.update(np.stack([frame, frame]))
     whiteness.forget(np.array([True, False]))
-    first, second = whiteness.update(np.stack([seen[0], seen[0]]))
-    assert first == 0.0
-    assert second > 0.6
     new = Whiteness(1, 4)
-    new.update(seen[:1])
     for frame in waving(FRAMES) + lasting((FRAMES, 22, 3), 0.1):
         assert whiteness.update(np.stack([frame, frame]))[0] == new.update(frame[None])[0]
 
