@@ -36,6 +36,8 @@ class Health:
         received: messages processed, by topic.
         ended: topics whose end of stream was seen.
         stamp_ns: capture stamp of the newest frame, nanoseconds.
+        queue: greatest queue length since the last report.
+        compute_ns: compute times of the newest frames, without the time that their publication waited for subscribers.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -47,11 +49,11 @@ class Health:
         self.ended: set[str] = set()
         self.stamp_ns = 0
         self._clock = clock
-        self._queue = 0
+        self.queue = 0
         self._received_ns = 0
         self._unanswered_ns: int | None = None  # time of the first input since the last output
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
-        self._compute_ns: deque[int] = deque(maxlen=SAMPLES)
+        self.compute_ns: deque[int] = deque(maxlen=SAMPLES)
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
         self._inherited: Counter[str] = Counter()
         self._published_before: Counter[str] = Counter()
@@ -101,14 +103,6 @@ class Health:
         if latency_ns is not None:
             self._latency_ns.append(latency_ns)
 
-    def note_computed(self, spent_ns: int) -> None:
-        """Record a frame's compute time, without the time that its publication waited for subscribers."""
-        self._compute_ns.append(spent_ns)
-
-    def note_queue(self, length: int) -> None:
-        """Record the current queue length; the report has the maximum."""
-        self._queue = max(self._queue, length)
-
     def report(
         self, node: str, received: Counter[str], status: Mapping[str, str], problems: Sequence[Problem] = ()
     ) -> Diagnostics:
@@ -126,8 +120,8 @@ class Health:
         worst = max(problems, key=lambda problem: problem.level, default=None)
         stalled = any(problem.cause == "no_output" for problem in problems)
         state = self.unread or "stalled" if self.state == "running" and (self.unread or stalled) else self.state
-        values = {"state": state, "ended": " ".join(sorted(self.ended)), "queue": str(self._queue)}
-        self._queue = 0
+        values = {"state": state, "ended": " ".join(sorted(self.ended)), "queue": str(self.queue)}
+        self.queue = 0
         values |= {f"count.{topic}": str(n) for topic, n in self.published.items()}
         values |= {f"in.{topic}": str(n) for topic, n in self.received.items()}
         values |= {f"rate.{topic}": f"{rate:.2f}" for topic, rate in self._rates.items()}
@@ -137,7 +131,7 @@ class Health:
             for topic, (first, last) in self._first_and_last_ns.items()
             if last - first > FRAME_NS  # messages of one moment have no rate
         }
-        values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self._compute_ns)
+        values |= _percentiles("latency_ms", self._latency_ns) | _percentiles("compute_ms", self.compute_ns)
         values |= {key: str(n) for key, n in sorted(counts.items())}
         values |= {"memory_mb": f"{resident_bytes() / 1e6:.1f}"} | dict(status) | as_values(problems)
         rates = ", ".join(f"{topic} {rate:.1f} Hz" for topic, rate in self._rates.items())

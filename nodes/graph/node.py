@@ -225,7 +225,7 @@ class Node(ABC):
         if received is None:
             self.settle()
             return False
-        self.health.note_queue(len(self.inbox))
+        self.health.queue = max(self.health.queue, len(self.inbox))
         topic, message = received
         if isinstance(message, Diagnostics):
             # several clients have different timelines
@@ -240,7 +240,7 @@ class Node(ABC):
         except Exception as error:
             self.refuse(topic, error)
         if not isinstance(message, Diagnostics):
-            self.health.note_computed(self.clock.monotonic_ns() - started - self._blocked_ns)
+            self.health.compute_ns.append(self.clock.monotonic_ns() - started - self._blocked_ns)
             if self._relay:
                 self._relay.handled()
                 # includes the messages that this node's predecessor handled, each once

@@ -53,7 +53,7 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
             clock.time_ns += 33_333_333
             for publisher, name in ((door, "door"), (desk, "desk")):
                 publisher.publish(POSE_RAW, streams[name][k])
-            until(lambda k=k: len(prior.health._compute_ns) == 2 * (k + 1))
+            until(lambda k=k: len(prior.health.compute_ns) == 2 * (k + 1))
 
         def answered() -> bool:
             while received := subscriber.receive(0):
