@@ -24,7 +24,8 @@ from steadypose.nodes.sources.source import RecordedSource
 from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.prior.events.detector import NOWHERE
+from steadypose.prior.events.detector import NOWHERE, EventSettings
+from steadypose.prior.settings import build_settings
 
 if TYPE_CHECKING:
     from steadypose.prior.clean.pipeline import PriorPipeline
@@ -144,10 +145,10 @@ class Diagnosis:
 
 
 class OfflineRun:
-    """Runs both pipelines on a recorded source, with ``[prior]`` and ``[trajectory]`` of a launch file. It can be
-    iterated once, and yields the messages of `stream`.
+    """Runs both pipelines on a recorded source, with ``[prior]``, ``[trajectory]`` and ``[events]`` of a launch file.
+    It can be iterated once, and yields the messages of `stream`.
 
-    ``timeline``, if given, collects the events; ``advanced`` is called after each frame of the input. ``diagnosis`` has
+    If ``events``, ``timeline`` collects them; ``advanced`` is called after each frame of the input. ``diagnosis`` has
     the problems of the input, ``stamps_ns`` its stamps, ``poses`` counts the bodies in the output so far. Raises
     LaunchError if a setting is unknown or its value invalid and, at the end, if no frame could be read.
     """
@@ -156,7 +157,8 @@ class OfflineRun:
         self,
         source: RecordedSource,
         settings: Settings,
-        timeline: EventTimeline | None = None,
+        *,
+        events: bool = False,
         advanced: Callable[[], None] = lambda: None,
     ) -> None:
         # imported late, because these imports compile loops
@@ -165,7 +167,8 @@ class OfflineRun:
         from steadypose.nodes.graph.trajectory_node import make_trajectory
 
         one_thread()
-        self._source, self._timeline, self._advanced = source, timeline, advanced
+        self._source, self._events, self._advanced = source, events, advanced
+        self.timeline = EventTimeline(build_settings(EventSettings, settings.get("events", {}), "events"))
         self._prior, self._trajectory = make_prior(settings["prior"]), make_trajectory(settings["trajectory"])
         self.stamps_ns: list[int] = []
         prior = PriorSettings.from_dict(settings["prior"])
@@ -190,8 +193,8 @@ class OfflineRun:
                 self.poses += len(message.bodies)
                 self._given += bool(message.bodies)
                 sensor, calibrated = message.sensor_pose.position, message.calibrated
-            elif self._timeline and topic == POSE_WORLD and isinstance(message, PoseWorld):
-                self._timeline.add(message, sensor, calibrated=calibrated)
+            elif self._events and topic == POSE_WORLD and isinstance(message, PoseWorld):
+                self.timeline.add(message, sensor, calibrated=calibrated)
             yield topic, message
         if not self.stamps_ns:
             raise LaunchError(f"{self._source.path}: expected frames, but none of {len(self._source)} could be read")

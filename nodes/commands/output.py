@@ -27,10 +27,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import write_csv, write_events
 from steadypose.nodes.sinks.recorder import LogTimes
 from steadypose.nodes.sources.recording import open_recording
-from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.body.layouts import add_layouts
-from steadypose.prior.events.detector import EventSettings
-from steadypose.prior.settings import build_settings
 
 In = Annotated[Path, tyro.conf.arg(name="in", metavar="IN")]
 Out = Annotated[Path, tyro.conf.arg(metavar="OUT")]
@@ -216,14 +213,13 @@ def clean_recording(
     check_replaceable(out, replace=replace, is_file=out.suffix in ARRAY_FILES)
     add_layouts(settings.get("skeletons", {}))
     frames = open_recording(source, settings.get("rig", {}))
-    timeline = EventTimeline(build_settings(EventSettings, settings.get("events", {}), "events")) if events else None
-    run = OfflineRun(frames, settings, timeline, advanced)
+    run = OfflineRun(frames, settings, events=events is not None, advanced=advanced)
     began(len(frames))
     started = time.perf_counter()
     write_output(out, run.arrays, lambda: run)
-    if events and timeline:
+    if events:
         with unfinished(events) as part:
-            write_events(part, timeline.events())
+            write_events(part, run.timeline.events())
     return Cleaned(
         frames=len(run.stamps_ns),
         duration_s=float(min(np.ptp(run.stamps_ns), np.diff(run.stamps_ns).clip(0).sum())) / 1e9,

@@ -28,10 +28,8 @@ from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_pa
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
-from steadypose.nodes.timeline import EventTimeline
 from steadypose.prior.body.layouts import CANONICAL, add_layouts
-from steadypose.prior.events.detector import EventSettings
-from steadypose.prior.settings import build_settings, nearest
+from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -226,12 +224,11 @@ def clean(
     """
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     checked = sections(settings, delay)
-    timeline = EventTimeline(build_settings(EventSettings, checked["events"], "events"))
     compile_missing(logger.warning)  # a minute of silence would look like a hang
-    run = OfflineRun(source, checked, timeline)
+    run = OfflineRun(source, checked, events=True)
     arrays = run.arrays()
     warn(run.diagnosis.texts)
-    return Poses(arrays, run.diagnosis.texts, run.refused, timeline.events())
+    return Poses(arrays, run.diagnosis.texts, run.refused, run.timeline.events())
 
 
 @suggesting
