@@ -288,14 +288,9 @@ def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bo
 
 def _found(visible: NDArray[np.bool_], times: Floats) -> NDArray[np.bool_]:
     """When a body is reported: once it has been visible for a while, until it is not."""
-    since = np.where(visible, 0.0, np.inf)
-    began = times[0] - 1.0  # a body that is visible at the start was visible before
-    for t in range(len(times)):
-        if visible[t]:
-            if t and not visible[t - 1]:
-                began = times[t]
-            since[t] = times[t] - began
-    return visible & (since >= _FIND_AFTER)
+    appears = visible & ~np.concatenate([[True], visible[:-1]])  # what is visible at the start was so before
+    began = np.maximum.accumulate(np.where(appears, times, times[0] - 1.0))
+    return visible & (times - began >= _FIND_AFTER)
 
 
 def _ids(reported: Sequence[NDArray[np.bool_]], times: Floats) -> list[NDArray[np.int64]]:

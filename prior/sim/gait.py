@@ -125,10 +125,6 @@ class Plan:
     moves: tuple[slice, ...]
     """slice of frames of each walk or turn"""
 
-    def when(self, seconds: float) -> int:
-        """Return the index of the frame at a time."""
-        return min(round(seconds * RATE), len(self.times) - 1)
-
 
 def plan(start: tuple[float, float], yaw: float, parts: Sequence[Stand | Walk | Turn]) -> Plan:
     """Build a plan part by part from the body's start position, facing ``yaw`` radians."""

@@ -226,31 +226,22 @@ def _oriented(direction: Floats, hinge: Floats, rest_direction: Floats, rest_pol
     return after @ before.T
 
 
-@dataclass(frozen=True)
-class _Limb:
-    joints: tuple[str, str, str]
-    rest_pole: Floats  # direction of elbow or knee in the rest pose
-
-
-_LEG = _Limb(("hip", "knee", "ankle"), np.array([1.0, 0.0, 0.0]))
-_ARM = _Limb(("shoulder", "elbow", "wrist"), np.array([-1.0, 0.0, 0.0]))
+_Limb = tuple[tuple[str, str, str], Floats]
+_LEG: _Limb = ("hip", "knee", "ankle"), np.array([1.0, 0.0, 0.0])
+_ARM: _Limb = ("shoulder", "elbow", "wrist"), np.array([-1.0, 0.0, 0.0])
+"""Joints of a limb, and the direction of knee or elbow in the rest pose."""
 
 
 def _limb(
-    rotations: Floats,
-    side: Side,
-    limb: _Limb,
-    parent: Floats,
-    start: Floats,
-    goal: Floats,
-    pole: Floats,
+    rotations: Floats, side: Side, limb: _Limb, parent: Floats, start: Floats, goal: Floats, pole: Floats,
     offsets: Floats,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Set the local rotations of a limb's two upper joints; returns the lower bone's world rotation."""
-    base, middle, end = (J[f"{side}_{name}"] for name in limb.joints)
+    joints, rest_pole = limb
+    base, middle, end = (J[f"{side}_{name}"] for name in joints)
     first, second, hinge = two_bone(start, goal, pole, np.linalg.norm(offsets[[middle, end]], axis=1))
-    upper = _oriented(first, hinge, offsets[middle], limb.rest_pole)
-    lower = _oriented(second, hinge, offsets[end], limb.rest_pole)
+    upper = _oriented(first, hinge, offsets[middle], rest_pole)
+    lower = _oriented(second, hinge, offsets[end], rest_pole)
     rotations[:, base] = np.swapaxes(parent, -1, -2) @ upper
     rotations[:, middle] = np.swapaxes(upper, -1, -2) @ lower
     return lower
@@ -292,7 +283,8 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
         pole = pole + weight * (_apply(chest, action.pole) - pole)
     # the shoulder girdle rises with a raised arm (scapulohumeral rhythm): above the horizontal, by a third
     raised = _apply(np.swapaxes(chest, -1, -2), wrist - at)
-    lift = np.radians(18.0) * _smooth_ramp((raised[:, 2] / lengths.sum() + 0.4) / 1.3)
+    u = np.clip((raised[:, 2] / lengths.sum() + 0.4) / 1.3, 0.0, 1.0)
+    lift = np.radians(18.0) * (u * u * (3 - 2 * u))
     rotations[:, collar] = Rotation.from_rotvec(np.multiply.outer(sign * lift, [1.0, 0.0, 0.0])).as_matrix()
     at, girdle, _ = place()
     wrist = at + _within_reach(wrist - at, lengths.sum())
@@ -309,11 +301,6 @@ def _within_reach(vector: Floats, full: float) -> Floats:
 
 def _apply(rotation: Floats, vector: Floats) -> Floats:
     return np.einsum("tij,tj->ti", rotation, np.broadcast_to(vector, (len(rotation), 3)))
-
-
-def _smooth_ramp(u: Floats) -> Floats:
-    u = np.clip(u, 0.0, 1.0)
-    return u * u * (3 - 2 * u)
 
 
 def _hanging(forward: Floats, sign: float, lengths: Floats) -> Floats:

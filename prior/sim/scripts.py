@@ -108,9 +108,9 @@ def _reach_for(intent: Intent, offsets: Floats, side: Side, start: float, target
     gaze = np.array([np.arctan2(target[1], max(target[0], 0.3)), np.clip(-target[2] + 0.35, -0.4, 0.7)])
     intent.gaze += body[:, None] * gaze * 0.5
     # targets are fixed to the plan, which stands still, not to the pelvis, which leans
-    heading = intent.plan.yaw[intent.plan.when(start)]
+    frame = round(start * RATE)
+    heading, (x, y) = intent.plan.yaw[frame], intent.plan.xy[frame]
     c, s = np.cos(heading), np.sin(heading)
-    x, y = intent.plan.xy[intent.plan.when(start)]
     height = -float(offsets[[J["left_hip"], J["left_knee"], J["left_ankle"], J["left_foot"]], 2].sum())
     world = np.array([x + c * target[0] - s * target[1], y + s * target[0] + c * target[1], height + target[2]])
     intent.arms[side].append(ArmAction(weight, world, np.array([-0.6, 0.5 * sign, -0.8]), "world"))
