@@ -26,7 +26,7 @@ from steadypose.nodes.graph.launch import Launch, in_launch_file
 from steadypose.nodes.graph.loops import COMPILED, compile_missing
 from steadypose.nodes.graph.node import RUN, WATCHER
 from steadypose.nodes.graph.process import ALIVE, READY, STOPPING, notify, stop_on_signals
-from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, RunLock, losses, write_health
+from steadypose.nodes.graph.run_state import HEALTH_FILE, LOSSES, Ledger, losses, run_lock, write_health
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import NODES, POSE_NODES, Delivery, load
 from steadypose.nodes.settings import STREAMS, located, printable
@@ -104,11 +104,11 @@ def run(
     for override in overrides:
         arguments += ["--set", override]
     stop_on_signals(signal.default_int_handler)
-    with RunLock(settled) as lock:
+    with run_lock(settled) as writes_health:
         if COMPILED & {*nodes}:
             compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
         identity = secrets.token_hex(8)
-        watched = _Run(settled, arguments, console, Clock(), identity=identity, writes_health=lock.has_health)
+        watched = _Run(settled, arguments, console, Clock(), identity=identity, writes_health=writes_health)
         return watched.watch()
 
 

@@ -8,12 +8,11 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from steadypose.msgs import Closing
 from steadypose.msgs.security import local_directory, make_private
 from steadypose.msgs.topics import DIAGNOSTICS
 from steadypose.msgs.types import Diagnostics, Level
@@ -25,35 +24,26 @@ from steadypose.nodes.settings import LaunchError
 HEALTH_FILE = "health.json"
 
 
-class RunLock(Closing):
-    """Locks the addresses of a run's nodes, and ``health.json`` if no other run holds it. A context manager.
-
-    Attributes:
-        has_health: whether this run writes ``health.json``; otherwise another run with other nodes does.
+@contextmanager
+def run_lock(launch: Launch) -> Iterator[bool]:
+    """Lock the addresses of a run's nodes. Yields whether this run writes ``health.json``; otherwise another run with
+    other nodes does. Raises LaunchError if another run uses one of the addresses.
     """
-
-    def __init__(self, launch: Launch) -> None:
-        """Take the locks. Raises LaunchError if another run uses one of the addresses."""
-        directory = launch.transport.make_ipc_directory()
-        self.has_health = True
-        with ExitStack() as stack:
-            for name in launch.nodes:
-                endpoint = launch.transport.endpoint(name)
-                if endpoint.startswith("ipc://"):
-                    holder = _take(stack, endpoint.removeprefix("ipc://") + ".lock")
-                else:  # a fixed directory, because launches with different socket directories share tcp ports
-                    make_private(local_directory())
-                    holder = _take(stack, f"{local_directory()}/{endpoint.replace('/', '')}.lock")
-                if holder is not None:
-                    raise LaunchError(
-                        f"{name} runs already at {endpoint}, in another `steadypose run`{holder}: stop that one, or "
-                        "give this one addresses of its own ([transport] directory, or [transport.endpoints])"
-                    )
-            self.has_health = _take(stack, f"{directory}/health.lock") is None
-            self._held = stack.pop_all()
-
-    def close(self) -> None:
-        self._held.close()
+    directory = launch.transport.make_ipc_directory()
+    with ExitStack() as stack:
+        for name in launch.nodes:
+            endpoint = launch.transport.endpoint(name)
+            if endpoint.startswith("ipc://"):
+                holder = _take(stack, endpoint.removeprefix("ipc://") + ".lock")
+            else:  # a fixed directory, because launches with different socket directories share tcp ports
+                make_private(local_directory())
+                holder = _take(stack, f"{local_directory()}/{endpoint.replace('/', '')}.lock")
+            if holder is not None:
+                raise LaunchError(
+                    f"{name} runs already at {endpoint}, in another `steadypose run`{holder}: stop that one, or "
+                    "give this one addresses of its own ([transport] directory, or [transport.endpoints])"
+                )
+        yield _take(stack, f"{directory}/health.lock") is None
 
 
 def _take(stack: ExitStack, path: str) -> str | None:

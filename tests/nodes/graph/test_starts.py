@@ -23,7 +23,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.loops import _locked, compile_from_the_beginning, compile_from_the_end
 from steadypose.nodes.graph.node import SUPERVISOR, WATCHER
 from steadypose.nodes.graph.process import own_command, own_environment, stop_on_signals
-from steadypose.nodes.graph.run_state import HEALTH_FILE, RunLock
+from steadypose.nodes.graph.run_state import HEALTH_FILE, run_lock
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import free_directory
 from steadypose.nodes.sources.pose_input import PoseInputNode
@@ -92,17 +92,20 @@ def test_locks_are_of_addresses_and_go_with_their_holder(folder: Path, make_laun
     source = make_launch(nodes='["pose_input"]')
     prior = make_launch(nodes='["prior"]', transport__endpoints=tcp)
     elsewhere = make_launch(nodes='["prior"]', transport__endpoints=tcp, transport__directory=folder / "other")
-    with RunLock(source) as first:
-        assert first.has_health
-        with RunLock(prior) as beside:
-            assert not beside.has_health, "another run writes it"
-            with pytest.raises(LaunchError, match=r"prior runs already at tcp://127\.0\.0\.1:7199"):
-                RunLock(elsewhere)
-        with pytest.raises(LaunchError, match="pose_input runs already"):
-            RunLock(source)
-        with RunLock(elsewhere):
+    with run_lock(source) as first:
+        assert first
+        with run_lock(prior) as beside:
+            assert not beside, "another run writes it"
+            with (
+                pytest.raises(LaunchError, match=r"prior runs already at tcp://127\.0\.0\.1:7199"),
+                run_lock(elsewhere),
+            ):
+                pass
+        with pytest.raises(LaunchError, match="pose_input runs already"), run_lock(source):
             pass
-    with RunLock(source):
+        with run_lock(elsewhere):
+            pass
+    with run_lock(source):
         pass
 
 
