@@ -106,7 +106,8 @@ def views(known: Bools) -> list[View]:
         found.append(View(first, weight))
         own[first:last] = np.maximum(own[first:last], weight)
         waiting = waiting[taken:]
-    for run in _runs(~known.all(axis=1) & (own < 1.0)):
+    settled = known.all(axis=1) | (own >= 1.0)
+    for run in gaps(settled[:, None]):
         first = max(run.start - AROUND, 0)
         more = max(-(-(run.end - first - LONGEST) // _HOP), 0)
         for start in range(first, first + more * _HOP + 1, _HOP):
@@ -114,10 +115,6 @@ def views(known: Bools) -> list[View]:
             weight = np.minimum(np.arange(1, end - start + 1), np.arange(end - start, 0, -1)) / (end - start)
             found.append(View(start, weight * (1.0 - own[start:end])))
     return found
-
-
-def _runs(rows: Bools) -> list[Gap]:
-    return gaps(~rows[:, None])
 
 
 MIN_SIGMA = 0.002

@@ -100,10 +100,6 @@ class Camera:
         return (z > self.near) & (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# Line of sight
-
-
 @dataclass(frozen=True)
 class Sight:
     """Occlusion of joints (T, J) from a camera."""
@@ -158,9 +154,6 @@ def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
     t = np.clip(((point - a) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-12), 0.0, 1.0)
     return np.linalg.norm(point - a - t[..., None] * along, axis=-1)
 
-
-# ---------------------------------------------------------------------------------------------------------------
-# The tracker
 
 _LIMB_ENDS = np.array([n.endswith(("elbow", "wrist", "ankle", "foot", "knee")) for n in JOINTS])
 _ON_TRUNK = np.isin(np.arange(len(JOINTS)), [*TRUNK, *COLLARS])
