@@ -19,7 +19,6 @@ from steadypose.msgs import Closing
 from steadypose.msgs.codec import check_size, encode, typestore
 from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
 from steadypose.msgs.security import (
-    ClientList,
     Keys,
     TransportError,
     is_local,
@@ -109,7 +108,7 @@ class Publisher(Closing):
         typestore()
         self.refused: Counter[str] = Counter()
         self._keys = keys
-        self._clients = ClientList(keys) if keys else None
+        self._clients = keys.clients() if keys else set()
         self.deliveries = Deliveries(reliable, resume.sequence if resume else {})
         self._listeners: set[Listener] = set()
         self._subscriptions: set[bytes] = set()
@@ -120,7 +119,7 @@ class Publisher(Closing):
         self._new_id = int.from_bytes(os.urandom(4), "little")  # so that topics not resumed do not look like repeats
         self._resumed = frozenset(resume.sequence) if resume else frozenset(TOPICS)
         self._context = zmq.Context()
-        self._authenticator = _authenticate(self._context, self._clients) if self._clients else None
+        self._authenticator = _authenticate(self._context, keys) if keys else None
         try:
             if transport == "ipc":
                 make_private(Path(host).parent)
@@ -234,7 +233,8 @@ class Publisher(Closing):
         self._note_subscribers()
         if self._authenticator and not self._authenticator.is_alive():
             raise RuntimeError("the thread that checks keys has ended; nobody is let in any more")
-        if self._clients and self._clients.revoked():
+        before, self._clients = self._clients, self._keys.clients() if self._keys else set()
+        if not before <= self._clients:
             self._begin_anew("revoked keys")
         if len(self._subscriptions) > 2 * MAX_SUBSCRIPTIONS:
             self._begin_anew(_CUT)
@@ -328,12 +328,12 @@ def milliseconds(seconds: float) -> int:
     return -1 if math.isinf(seconds) else math.ceil(seconds * 1000)
 
 
-def _authenticate(context: zmq.Context[zmq.Socket[bytes]], clients: ClientList) -> ThreadAuthenticator:
+def _authenticate(context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> ThreadAuthenticator:
     from zmq.auth.thread import ThreadAuthenticator  # imported late: it imports asyncio, which nothing else needs
 
     class KeyList:
         def callback(self, domain: str, key: bytes) -> bool:
-            return clients.allows(key)
+            return key in keys.clients()
 
     authenticator = ThreadAuthenticator(context)
     authenticator.start()

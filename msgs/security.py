@@ -168,30 +168,14 @@ class Keys:
             raise ValueError(f"{endpoint}: expected its public key in {self.directory}/servers/{host}.key, found none")
         return self.server
 
-
-class ClientList:
-    """The public keys that may subscribe, reread from the directory of keys at each call. They include `Keys.public`,
-    for subscribers on the same machine."""
-
-    def __init__(self, keys: Keys) -> None:
-        self._keys = keys
-        self._served = self._read()
-
-    def allows(self, key: bytes) -> bool:
-        """Whether the holder of this public key may subscribe."""
-        return key in self._read()
-
-    def revoked(self) -> bool:
-        """Whether keys were removed from the list since the last call."""
-        before, self._served = self._served, self._read()
-        return not before <= self._served
-
-    def _read(self) -> frozenset[bytes]:
-        listed = {self._keys.public}
-        for file in (self._keys.directory / "clients").glob("*.key"):
+    def clients(self) -> set[bytes]:
+        """The public keys that may subscribe, as the directory lists them now, and `public`, for subscribers on the
+        same machine."""
+        listed = {self.public}
+        for file in (self.directory / "clients").glob("*.key"):
             with suppress(ValueError, OSError):  # a file that is still being written is ignored
                 listed.add(_public(file))
-        return frozenset(listed)
+        return listed
 
 
 def _listed(directory: Path) -> dict[str, bytes]:
