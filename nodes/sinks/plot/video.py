@@ -84,21 +84,15 @@ def write_video(history: History, path: Path, body: int | None = None) -> int:
     return count
 
 
-class View:
-    """An orthographic projection of the world's points to the image's right and up.
+def seen_from(front: Floats) -> Floats:
+    """(3, 2) matrix that projects the world's points, (..., 3) metres, to the image's right and up, (..., 2) metres.
 
     The viewer is in the direction ``front`` (3,), a horizontal unit vector, rotated by `TURNED`.
     """
-
-    def __init__(self, front: Floats) -> None:
-        cos, sin = np.cos(TURNED), np.sin(TURNED)
-        toward = np.array([cos * front[0] - sin * front[1], sin * front[0] + cos * front[1], 0.0])
-        up = np.cos(ELEVATION) * np.array([0.0, 0.0, 1.0]) - np.sin(ELEVATION) * toward
-        self._axes = np.stack([[-toward[1], toward[0], 0.0], up], axis=1)
-
-    def __call__(self, points: Floats) -> Floats:
-        """(..., 2) metres of points (..., 3) metres."""
-        return points @ self._axes
+    cos, sin = np.cos(TURNED), np.sin(TURNED)
+    toward = np.array([cos * front[0] - sin * front[1], sin * front[0] + cos * front[1], 0.0])
+    up = np.cos(ELEVATION) * np.array([0.0, 0.0, 1.0]) - np.sin(ELEVATION) * toward
+    return np.stack([[-toward[1], toward[0], 0.0], up], axis=1)
 
 
 def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDArray[np.uint8]]:
@@ -108,7 +102,7 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
     from matplotlib.lines import Line2D
 
     raw, clean, world = (history.track(topic, body) for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD))
-    view = View(next((f for row in lead.positions if (f := facing(row)) is not None), np.array([1.0, 0.0, 0.0])))
+    view = seen_from(next((f for row in lead.positions if (f := facing(row)) is not None), np.array([1.0, 0.0, 0.0])))
     draws: dict[str, Callable[[Axes, int], None]] = {}
     if clean is not None:
         if np.isfinite(clean.raw).any():
@@ -150,7 +144,7 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Callable[[Axes, int], None]:
+def _follower(track: Track, view: Floats, draw: Callable[[Axes, int], None]) -> Callable[[Axes, int], None]:
     """A function that draws a panel filled by the body, which stays in its middle."""
     middle = _smooth(np.nanmean(np.where(np.isfinite(track.positions), track.positions, np.nan), axis=1))
     low, high = np.nanpercentile(track.positions[..., 2], (1, 99)) if len(track.time) else (0.0, 1.8)
@@ -159,7 +153,7 @@ def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Ca
 
     def panel(ax: Axes, row: int) -> None:
         draw(ax, row)
-        centre = view(middle[row])
+        centre = middle[row] @ view
         aspect = PANEL_INCHES[0] / (0.845 * PANEL_INCHES[1])
         ax.set_xlim(centre[0] - half * aspect, centre[0] + half * aspect)
         ax.set_ylim(centre[1] - half, centre[1] + half)
@@ -167,7 +161,7 @@ def _follower(track: Track, view: View, draw: Callable[[Axes, int], None]) -> Ca
     return panel
 
 
-def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, int], None]:
+def _stage(world: Track, at: NDArray[np.intp], view: Floats) -> Callable[[Axes, int], None]:
     """A function that draws the body at its position on the floor, with its path."""
     floor = float(np.nanpercentile(world.positions[..., 2].min(axis=1), 5))
     root = world.positions[:, 0] * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]
@@ -175,38 +169,37 @@ def _stage(world: Track, at: NDArray[np.intp], view: View) -> Callable[[Axes, in
     across, along = (np.linspace(low[axis], high[axis], 7) for axis in (0, 1))
     lines = [np.array([[x, low[1], floor], [x, high[1], floor]]) for x in across]
     lines += [np.array([[low[0], y, floor], [high[0], y, floor]]) for y in along]
-    corners = view(
-        np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (floor, floor + TALL)])
-    )
+    corners = [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (floor, floor + TALL)]
+    corners = np.array(corners) @ view
     (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
 
     def panel(ax: Axes, row: int) -> None:
         from matplotlib.collections import LineCollection
 
         here = int(at[row])
-        ax.add_collection(LineCollection([view(line) for line in lines], colors=FLOOR, linewidths=0.8))
-        ax.plot(*view(root[max(here - PATH_FRAMES, 0) : here + 1]).T, color=MIDDLE_COLOUR, lw=1.2, alpha=FAINT)
+        ax.add_collection(LineCollection([line @ view for line in lines], colors=FLOOR, linewidths=0.8))
+        ax.plot(*(root[max(here - PATH_FRAMES, 0) : here + 1] @ view).T, color=MIDDLE_COLOUR, lw=1.2, alpha=FAINT)
         _sticks(ax, view, world, here)
         loaded = world.positions[here, CONTACT_INDICES[world.contacts[here] > 0.5]]
-        ax.plot(*view(loaded).T, "o", color=CONTACT_COLOUR, markersize=4, markeredgewidth=0)
+        ax.plot(*(loaded @ view).T, "o", color=CONTACT_COLOUR, markersize=4, markeredgewidth=0)
         ax.set_xlim(left, right)
         ax.set_ylim(bottom, top)
 
     return panel
 
 
-def _raw(ax: Axes, view: View, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
+def _raw(ax: Axes, view: Floats, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
     """Draw the input over the output."""
-    draw_bones(ax, view(clean.positions[row]), ALL_BONES, GHOST, width=2.0)
-    draw_bones(ax, view(clean.raw[row]), shown, _sides(shown), width=3.0)
+    draw_bones(ax, clean.positions[row] @ view, ALL_BONES, GHOST, width=2.0)
+    draw_bones(ax, clean.raw[row] @ view, shown, _sides(shown), width=3.0)
 
 
-def _sticks(ax: Axes, view: View, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
+def _sticks(ax: Axes, view: Floats, track: Track, row: int, shown: NDArray[np.intp] = ALL_BONES) -> None:
     opacity = np.ones(len(shown))
     if track.state.size:
         observed = np.isin(track.state[row], OBSERVED)
         opacity = np.where(observed[shown].all(axis=1), 1.0, FAINT)
-    draw_bones(ax, view(track.positions[row]), shown, _sides(shown), width=3.0, alpha=opacity)
+    draw_bones(ax, track.positions[row] @ view, shown, _sides(shown), width=3.0, alpha=opacity)
 
 
 def _sides(shown: NDArray[np.intp]) -> list[str]:

@@ -10,7 +10,7 @@ from steadypose.nodes.cli import main
 from steadypose.nodes.commands.complete import complete
 from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import history_of_path
-from steadypose.nodes.sinks.plot.video import View
+from steadypose.nodes.sinks.plot.video import seen_from
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import J
 
@@ -110,8 +110,8 @@ def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
 
 
 def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
-    view = View(np.array([1.0, 0.0, 0.0]))  # in canonical axes the body's left is +y
-    origin, up, left = view(np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]))
+    view = seen_from(np.array([1.0, 0.0, 0.0]))  # in canonical axes the body's left is +y
+    origin, up, left = np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]) @ view
     assert up[1] > origin[1] + 0.9
     assert left[0] > origin[0] + 0.8
 
