@@ -48,12 +48,8 @@ def parse(endpoint: str) -> tuple[str, str]:
 def is_local(endpoint: str) -> bool:
     """Whether an address can be reached from this machine only."""
     transport, host = parse(endpoint)
-    return transport == "ipc" or _is_loopback(host)
-
-
-def _is_loopback(host: str) -> bool:
     try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+        return transport == "ipc" or host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
 

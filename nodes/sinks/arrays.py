@@ -119,16 +119,12 @@ def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void
         if name in _NEAREST:
             rows[name][known] = values[nearest][known]
         elif name != "stamp_ns":
-            mix = _slerp if name == "rotations" else _lerp
             weight = fraction.reshape(-1, *[1] * (values.ndim - 1))
-            mixed = mix(values[before].astype(np.float64), values[after].astype(np.float64), weight)
+            a, b = values[before].astype(np.float64), values[after].astype(np.float64)
+            mixed = _slerp(a, b, weight) if name == "rotations" else a + weight * (b - a)
             rows[name][known] = np.where(np.isnan(mixed), values[nearest], mixed)[known]
     rows["stamp_ns"] = stamps_ns
     return rows
-
-
-def _lerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
-    return a + fraction * (b - a)
 
 
 def _slerp(a: NDArray[np.float64], b: NDArray[np.float64], fraction: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -225,7 +225,8 @@ class CsvSource:
                 stamp_ns = _stamp_ns(number, float(numbers[stamp]))
                 id = 0 if body == -1 else _id(number, float(numbers[body]))
             except _RowError as error:
-                refused.setdefault(error.cause, []).append(error.where)
+                cause, where = error.args
+                refused.setdefault(cause, []).append(where)
                 continue
             joints, confidences = numbers[positions], numbers[confidence][:, 0]
             confidences = np.where(np.isnan(confidences), np.isfinite(joints).all(axis=-1), confidences)
@@ -237,11 +238,7 @@ class CsvSource:
 
 
 class _RowError(ValueError):
-    """A row that is no frame: the cause, in the plural, and where."""
-
-    def __init__(self, cause: str, where: str) -> None:
-        super().__init__(cause, where)
-        self.cause, self.where = cause, where
+    """A row that is no frame. Its arguments are the cause, in the plural, and where."""
 
 
 def _number(row: int, column: str, cell: str) -> float:

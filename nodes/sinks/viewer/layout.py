@@ -96,13 +96,21 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool =
     )
 
     def scene(origin: str, name: str, *, distance: float, height: float, floor: bool) -> rrb.Spatial3DView:
+        controls = None
+        if eye is not None:
+            aside = np.array([-eye.front[1], eye.front[0], 0.0])
+            place = eye.target + distance * (0.94 * eye.front + 0.34 * aside) + [0, 0, height]
+            controls = rrb.EyeControls3D(
+                kind="orbital", position=place, look_target=eye.target, eye_up=[0, 0, 1],
+                tracking_entity=f"/{origin}/focus",
+            )  # fmt: skip
         return rrb.Spatial3DView(
             origin="/",
             contents=f"/{origin}/**",
             name=name,
             background=DARK_RGB,
             line_grid=rrb.LineGrid3D(visible=floor, spacing=0.5, color=[120, 130, 150, 90]),
-            eye_controls=_eye_controls(eye, origin, distance, height),
+            eye_controls=controls,
         )
 
     def plot(origin: str, name: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
@@ -138,16 +146,4 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool =
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
-    )
-
-
-def _eye_controls(eye: Eye | None, origin: str, distance: float, height: float) -> rrb.EyeControls3D | None:
-    import rerun.blueprint as rrb
-
-    if eye is None:
-        return None
-    aside = np.array([-eye.front[1], eye.front[0], 0.0])
-    position = eye.target + distance * (0.94 * eye.front + 0.34 * aside) + [0, 0, height]
-    return rrb.EyeControls3D(
-        kind="orbital", position=position, look_target=eye.target, eye_up=[0, 0, 1], tracking_entity=f"/{origin}/focus"
     )
