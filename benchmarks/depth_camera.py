@@ -54,16 +54,13 @@ class Stereo:
         return image[..., :2] / image[..., 2:]
 
 
-def room(camera: Stereo, height: float, pitch: float, wall: float) -> Floats:
-    """Return the depth (H, W) of an empty room, metres, for a camera ``height`` metres above the floor that looks down
-    by ``pitch`` radians at a ``wall`` so many metres away.
+def room(camera: Stereo, height: float, wall: float) -> Floats:
+    """Return the depth (H, W) of an empty room, metres, for a level camera ``height`` metres above the floor before a
+    ``wall`` so many metres away.
     """
-    rays = _rays(camera)
-    ahead = np.array([0.0, -np.sin(pitch), np.cos(pitch)])  # level, optical frame
-    down = np.array([0.0, np.cos(pitch), np.sin(pitch)])
+    down = _rays(camera)[..., 1]
     with np.errstate(divide="ignore"):
-        depths = [wall / (rays @ ahead), height / (rays @ down)]
-    return np.min([np.where(d > 0, d, np.inf) for d in depths], axis=0)
+        return np.where(down > 0, np.minimum(height / down, wall), wall)
 
 
 def render(people: Sequence[tuple[Floats, Floats]], camera: Stereo, background: Floats) -> Floats:

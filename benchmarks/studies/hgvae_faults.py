@@ -36,7 +36,6 @@ def noise(windows: Floats, rng: np.random.Generator, sigma: float) -> tuple[Floa
 
 def exchanged(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
     """Swap limbs of both sides from `BEGINS` on; this counts as a fault only where they are apart."""
-    del rng
     both = np.array([*limb, *MIRROR[limb]])
     out = windows.copy()
     out[:, BEGINS:, both] = windows[:, BEGINS:, MIRROR[both]]
@@ -80,20 +79,17 @@ def other_persons_limb(windows: Floats, rng: np.random.Generator) -> tuple[Float
 
 def relabelled(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """Swap left and right everywhere: the knees bend the wrong way."""
-    del rng
     return windows[:, :, MIRROR], _all(windows)
 
 
 def mirrored(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """Mirror the motion: no fault."""
-    del rng
     return windows[:, :, MIRROR] * np.array([1.0, -1.0, 1.0]), _all(windows)
 
 
 def in_depth(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tuple[Floats, NDArray[np.bool_]]:
     """Place people 3 m from a camera at the origin, and mirror a limb (its root first) about the image plane from
     `BEGINS` on; this counts as a fault only where it moves a joint."""
-    del rng
     placed = windows - windows[:, :1, :1] + np.array([3.0, 0.0, 0.0])
     out, root = placed.copy(), placed[:, BEGINS:, limb[:1]]
     ray = root / np.linalg.norm(root, axis=-1, keepdims=True)
@@ -103,7 +99,6 @@ def in_depth(windows: Floats, rng: np.random.Generator, limb: list[int]) -> tupl
 
 def reversed_in_time(windows: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.bool_]]:
     """Play backwards: usually no fault."""
-    del rng
     return windows[:, ::-1].copy(), _all(windows)
 
 

@@ -168,16 +168,12 @@ def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) ->
     turned = [quaternions(global_rotations(np.asarray(r[:, gap]))) for r in (rotations, truth.rotations)]
     l2q = np.stack([quaternion_distance(a, b) for a, b in zip(*turned, strict=True)]).mean(axis=1)
     turn = yaw_matrix(heading(truth.rotations[:, gap.start - 1, 0]))[:, None]
-    off = (joints - truth.positions)[:, gap] @ turn / deviation
-    l2p = np.sqrt((off**2).sum(axis=(-1, -2))).mean(axis=1)
+    off = joints - truth.positions
+    l2p = np.sqrt(((off[:, gap] @ turn / deviation) ** 2).sum(axis=(-1, -2))).mean(axis=1)
     sign = np.where((turned[0] * turned[1]).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
     shape = (len(root), gap.stop - gap.start, -1)
-    error = np.linalg.norm(joints - truth.positions, axis=-1)[:, gap].mean(axis=(1, 2))
-    local = np.linalg.norm(
-        (joints - joints[:, :, :1]) - (truth.positions - truth.positions[:, :, :1]), axis=-1
-    )[:, gap].mean(axis=(1, 2))  # fmt: skip
-    bends = [np.linalg.norm(np.diff(x[:, around], n=2, axis=1), axis=-1) for x in (joints, truth.positions)]
-    missed = np.linalg.norm(np.diff((joints - truth.positions)[:, around], n=2, axis=1), axis=-1)
+    error, local = (np.linalg.norm(x[:, gap], axis=-1) for x in (off, off - off[:, :, :1]))
+    bend, missed = (np.linalg.norm(np.diff(x[:, around], n=2, axis=1), axis=-1) for x in (joints, off))
     stamps = np.arange(gap.stop - gap.start + 2) / 30.0
     edges = slice(gap.start - 1, gap.stop + 1)
     skate = [
@@ -190,7 +186,7 @@ def measure(truth: Truth, rotations: Floats, root: Floats, deviation: Floats) ->
         "npss": round(npss((sign * turned[0]).reshape(shape), turned[1].reshape(shape)), 4),
         "position_mm": round(float(error.mean()) * 1e3, 2),
         "local_mm": round(float(local.mean()) * 1e3, 2),
-        "own_acceleration_mm": round(float(bends[0].mean()) * 1e3, 3),
+        "own_acceleration_mm": round(float(bend.mean()) * 1e3, 3),
         "acceleration_mm": round(float(missed.mean()) * 1e3, 3),
         "skate_m_s": round(float(np.nanmean(np.stack(skate))), 4),
         "clips": len(root),

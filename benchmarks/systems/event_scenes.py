@@ -277,17 +277,12 @@ class Score:
     delays_s: list[float] = field(default_factory=list)
 
     @property
-    def precision(self) -> float:
-        return self.met / (self.met + self.false) if self.met + self.false else float("nan")
-
-    @property
-    def recall(self) -> float:
-        return self.met / (self.met + self.missed) if self.met + self.missed else float("nan")
-
-    @property
-    def f1(self) -> float:
-        whole = 2 * self.met + self.missed + self.false
-        return 2 * self.met / whole if whole else float("nan")
+    def shares(self) -> tuple[float, float, float]:
+        """Precision, recall and F1; NaN of nothing."""
+        met, missed, false = self.met, self.missed, self.false
+        pairs = (met, met + false), (met, met + missed), (2 * met, 2 * met + missed + false)
+        precision, recall, f1 = (part / whole if whole else math.nan for part, whole in pairs)
+        return precision, recall, f1
 
     def add(self, other: Score) -> None:
         self.met, self.missed, self.false = self.met + other.met, self.missed + other.missed, self.false + other.false

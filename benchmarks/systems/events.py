@@ -122,7 +122,7 @@ def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str
             [
                 kind,
                 str(found.met + found.missed),
-                *(f"{share:.3f}" for share in (found.precision, found.recall, found.f1)),
+                *(f"{share:.3f}" for share in found.shares),
                 *(f"{1e3 * q:.0f}" for q in np.quantile(found.delays_s or [np.nan], (0.5, 0.95))),
             ]
             for kind, found in [*rows, ("all", whole)]

@@ -53,7 +53,7 @@ def moment(frame: int, people: int = 1) -> Moment:
         optical = (body - EYE) @ TO_OPTICAL.T
         joints.append(sensor_joints(COCO17, optical))
         flesh.append((optical, REST_OFFSETS))
-    depth = render(flesh, CAMERA, room(CAMERA, EYE[2], 0.0, 6.0))
+    depth = render(flesh, CAMERA, room(CAMERA, EYE[2], 6.0))
     return Moment(joints, (1000 * depth).astype(np.uint16))
 
 

@@ -152,7 +152,7 @@ def standing(yaw: float) -> np.ndarray:
 @pytest.mark.parametrize("degrees", [0, 40, 75, 90, -75, 180])
 def test_the_root_holds_however_the_body_is_turned(degrees: int) -> None:
     joints = standing(np.radians(degrees))
-    clean = render([(joints, REST_OFFSETS)], CAMERA, room(CAMERA, 1.2, 0.0, 5.0))
+    clean = render([(joints, REST_OFFSETS)], CAMERA, room(CAMERA, 1.2, 5.0))
     depth = corrupt(clean, CAMERA, np.random.default_rng(degrees % 360))
     weights = COCO17.to_canonical
     truth = np.full((17, 3), np.nan)
