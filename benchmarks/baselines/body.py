@@ -9,6 +9,8 @@ frame separately. This is what linear correlation alone knows of a body.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from steadypose.prior.arrays import Floats
@@ -104,10 +106,11 @@ class ConditionalGaussian:
         return poses.reshape(seen.shape)
 
 
-def facing(poses: Floats) -> Floats:
+def facing(poses: Floats, pairs: Sequence[tuple[int, int]] = _ACROSS) -> Floats:
     """Return the heading (...) of poses (..., 22, 3), radians about z.
 
-    It is the normal of the line from the right hip and shoulder to the left, because the pelvis' rotation is unknown.
+    It is the normal of the lines from the right to the left joint of these ``pairs``, by default of hips and shoulders,
+    because the pelvis' rotation is unknown.
     """
-    across = np.sum([poses[..., left, :] - poses[..., right, :] for left, right in _ACROSS], axis=0)
+    across = np.sum([poses[..., left, :] - poses[..., right, :] for left, right in pairs], axis=0)
     return np.arctan2(-across[..., 0], across[..., 1])

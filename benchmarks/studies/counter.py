@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from steadypose.benchmarks.baselines.banks import whole_body_bank
+from steadypose.benchmarks.baselines.body import facing
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.metrics import sigma_ratio
 from steadypose.benchmarks.provenance import WORLD
@@ -60,9 +61,8 @@ def truth_at(motion: Motion, scene: str, stamps_s: Floats) -> Body:
     upright, low = TOE_HEIGHT - motion.offsets[LEG, 2].sum(), height.min()
     seat = low + 0.15 * (np.quantile(height, 0.9) - low) if scene == "sits" else 0.0
     posture = np.where(p[:, 0, 2] < seat, SITS, np.where(p[:, 0, 2] > 0.85 * upright, STANDS, 0))
-    left = p[:, HIPS[0]] - p[:, HIPS[1]] + p[:, SHOULDERS[0]] - p[:, SHOULDERS[1]]
-    facing = np.arctan2(-left[:, 0], left[:, 1])
-    return {"facing": facing, "root": p[:, 0], "head": p[:, J["head"], 2], "posture": posture, "feet": p[:, list(FEET)]}
+    head, feet = p[:, J["head"], 2], p[:, list(FEET)]
+    return {"facing": facing(p), "root": p[:, 0], "head": head, "posture": posture, "feet": feet}
 
 
 def behind(frames: Sequence[PoseRaw], joints: Sequence[int]) -> list[PoseRaw]:
@@ -105,10 +105,9 @@ def rules(frames: Sequence[PoseRaw]) -> Body:
     p = whole_body_bank(seen, stamps_s, PriorSettings().delay)
     (left, right), hips_seen = SHOULDERS, np.isfinite(seen[:, 0]).any()
     root = p[:, 0] if hips_seen else 0.5 * (p[:, left] + p[:, right]) - [0.0, 0.0, TRUNK]
-    across = p[:, left] - p[:, right]
-    facing = np.arctan2(-across[:, 0], across[:, 1])
     posture = np.where(root[:, 2] > UP, STANDS, SITS)
-    return {"stamps_s": stamps_s, "facing": facing, "root": root, "head": p[:, J["head"], 2], "posture": posture}
+    found = {"facing": facing(p, (SHOULDERS,)), "root": root, "head": p[:, J["head"], 2], "posture": posture}
+    return {"stamps_s": stamps_s, **found}
 
 
 def errors(found: Body, motion: Motion, scene: str) -> dict[str, Floats]:

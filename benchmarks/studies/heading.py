@@ -7,12 +7,13 @@ the pelvis, against the mean of hips and shoulders that of the trunk, which `hip
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from steadypose.benchmarks import product
+from steadypose.benchmarks.baselines.body import facing
 from steadypose.benchmarks.baselines.rotations import Baseline, baselines
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.motion import side_by_side
@@ -24,7 +25,7 @@ from steadypose.msgs.types import PoseRaw, PoseWorld
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import heading, quaternion_product, rotation_matrix
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import HIPS, SHOULDERS
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.rate import FPS
@@ -32,7 +33,7 @@ from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
 
 DEPENDS_ON = VARIANTS
 
-_PARTS = {"pelvis": ("hip",), "trunk": ("hip", "shoulder")}
+_PARTS = {"pelvis": (HIPS,), "trunk": (HIPS, SHOULDERS)}
 """Parts whose heading the Kinect's is compared with."""
 _STREAMS = ROOT / "sim_data"
 
@@ -92,16 +93,9 @@ def _kinect(bench: Bench, roots: Mapping[str, Baseline]) -> dict[str, dict[str, 
             if name == STEADYPOSE:
                 mine |= {other: root(cleaned.positions[:length, clip]) for other, root in roots.items()}
             for (of, parts), (method, turned) in itertools.product(_PARTS.items(), mine.items()):
-                apart = wrapped(heading(turned) - _heading(recorded.vicon, parts))
+                apart = wrapped(heading(turned) - facing(recorded.vicon, parts))
                 off.setdefault(of, {}).setdefault(method, []).append(apart - np.nanmedian(apart))
     return {of: {method: spread(np.concatenate(parts)) for method, parts in each.items()} for of, each in off.items()}
-
-
-def _heading(vicon: Floats, parts: Sequence[str]) -> Floats:
-    """Return the heading (T,) of joints (T, 22, 3), radians: the mean direction of these parts from right to left,
-    turned forward."""
-    left = np.sum([vicon[:, J[f"left_{part}"]] - vicon[:, J[f"right_{part}"]] for part in parts], axis=0)
-    return np.arctan2(-left[:, 0], left[:, 1])
 
 
 def _kinect_table(kinect: Mapping[str, Mapping[str, list[float]]]) -> Table:

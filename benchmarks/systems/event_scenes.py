@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.benchmarks.baselines.body import facing
 from steadypose.msgs.types import EventKind, Hand
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.capsules import TOE_HEIGHT, random_offsets
@@ -192,11 +193,9 @@ def _person(rng: np.random.Generator) -> Floats:
 def common(person: int, motion: Motion) -> list[Label]:
     """Label from the true joints of any scene: near, facing the camera, upright, hands above the neck."""
     s, p, t = EventSettings(), motion.positions, motion.times
-    left = p[:, J["left_hip"]] - p[:, J["right_hip"]] + p[:, J["left_shoulder"]] - p[:, J["right_shoulder"]]
-    facing = np.arctan2(-left[:, 0], left[:, 1])
     away = np.hypot(motion.root[:, 0], motion.root[:, 1])
     toward = np.arctan2(-motion.root[:, 1], -motion.root[:, 0])
-    turned = np.abs(np.angle(np.exp(1j * (facing - toward))))
+    turned = np.abs(np.angle(np.exp(1j * (facing(p) - toward))))
     hips = motion.root[:, 2]
     tall = -float(motion.offsets[LEG, 2].sum()) + TOE_HEIGHT
     up = hips > 0.5 * tall
