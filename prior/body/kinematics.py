@@ -16,19 +16,13 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.skeleton import JOINTS, PARENTS, J, finite_joints
+from steadypose.prior.body.skeleton import BONES_BETWEEN, JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.compiled import njit
 
-
-def _levels() -> list[slice]:
-    depth = [0] * len(PARENTS)
-    for joint, parent in enumerate(PARENTS):
-        depth[joint] = 0 if parent < 0 else depth[parent] + 1
-    assert depth == sorted(depth), "the canonical order is breadth first"
-    return [slice(depth.index(d), len(depth) - depth[::-1].index(d)) for d in range(max(depth) + 1)]
-
-
-LEVELS: list[slice] = _levels()
+_DEPTH = BONES_BETWEEN[0].tolist()
+LEVELS: list[slice] = [
+    slice(_DEPTH.index(depth), len(_DEPTH) - _DEPTH[::-1].index(depth)) for depth in range(max(_DEPTH) + 1)
+]
 """Joints by depth in the tree. Joints of one level depend only on the level above and are processed together."""
 
 CONTACT_JOINTS: tuple[int, ...] = tuple(

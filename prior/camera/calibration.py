@@ -265,13 +265,8 @@ def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> 
     to_world = Rotation.from_rotvec(turn).inv()
     # by the Gauss-Markov theorem; the camera's position is -R^T t, so both errors affect it
     covariance = max(error, CORNER_SIGMA_PX) ** 2 * np.linalg.inv(fit.jac.T @ fit.jac)
-    place = np.empty((3, 6))
-    for k in range(3):
-        step = np.zeros(3)
-        step[k] = 1e-6
-        nudged = Rotation.from_rotvec(turn + step).inv().apply(move)
-        place[:, k] = -(nudged - to_world.apply(move)) / 1e-6
-        place[:, 3 + k] = -to_world.as_matrix()[:, k]
+    nudged = Rotation.from_rotvec(turn + 1e-6 * np.eye(3)).inv().apply(move)
+    place = np.column_stack([(to_world.apply(move) - nudged).T / 1e-6, -to_world.as_matrix()])
     return Placement(
         pose=Pose(-to_world.apply(move), to_world.as_quat()),
         error_px=error,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from steadypose.prior.body.layouts import COCO17, SKELETONS, add_layouts, to_canonical
-from steadypose.prior.body.skeleton import JOINTS, MIRROR, PARENTS, REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.body.skeleton import BONES_BETWEEN, JOINTS, MIRROR, PARENTS, REST_OFFSETS, REST_POSITIONS, J
 
 EXPECTED_COUNTS = {
     "smpl22": 22, "coco17": 17, "blazepose33": 33, "h36m17": 17, "kinect22": 22, "azure_kinect32": 32, "zed38": 38,
@@ -38,6 +38,7 @@ def test_left_joints_come_from_left_joints(skeleton) -> None:
 
 def test_the_tree_is_symmetric_and_breadth_first() -> None:
     assert all(p < j for j, p in enumerate(PARENTS))
+    assert (np.diff(BONES_BETWEEN[0]) >= 0).all()
     assert np.array_equal(MIRROR[MIRROR], np.arange(22))
     assert np.allclose(REST_OFFSETS[MIRROR] * [1, -1, 1], REST_OFFSETS)
 
