@@ -31,6 +31,8 @@ SECOND_NS = 1_000_000_000
 class Frames:
     """A source that gives the messages it was given."""
 
+    path = Path("frames")
+
     def __init__(self, stamps_ns: list[int]) -> None:
         self.refused: Counter[str] = Counter()
         self._stamps_ns = stamps_ns
