@@ -132,14 +132,14 @@ def test_rotations_and_bones_place_the_joints_where_they_are_said_to_be() -> Non
 
 
 @pytest.mark.parametrize("up", ["y", "-y"])
-def test_the_answer_is_in_the_sensors_frame(up: str) -> None:
-    pose = Pose.from_up(up)
-    turn = Rotation.from_quat(pose.orientation)
-    world = noisy(20, 0.02)
-    seen = turn.inv().apply(world.reshape(-1, 3)).reshape(world.shape)
-    upright, _ = clean(stream(world))
-    tilted, _ = clean(stream(seen, pose=pose))
-    assert np.allclose(turn.apply(positions(tilted).reshape(-1, 3)).reshape(world.shape), positions(upright), atol=1e-4)
+def test_the_answer_is_in_the_sensors_frame_wherever_the_body_stands_and_faces(up: str) -> None:
+    pose, about_z, step = Pose.from_up(up), yaw_matrix(1.1), np.array([3.0, -2.0, 0.4])
+    turn = Rotation.from_quat(pose.orientation).as_matrix()
+    seen = noisy(45, 0.02)
+    seen[20:, [J["left_elbow"], J["left_wrist"]]] = seen[:, [J["right_knee"], J["right_ankle"]]] = np.nan
+    moved = (seen @ about_z.T + step) @ turn
+    here, there = (positions(clean(messages)[0]) for messages in (stream(seen), stream(moved, pose=pose)))
+    assert np.allclose((there @ turn.T - step) @ about_z, here, atol=1e-5)
 
 
 def test_a_joint_hidden_for_seconds_is_known_as_long_as_it_is_completed() -> None:

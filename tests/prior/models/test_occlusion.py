@@ -104,14 +104,6 @@ def test_joints_keep_their_place_beside_the_body(seed: int) -> None:
         np.testing.assert_allclose(row.candidates[:, 2], expected[t, row.body, row.joint], atol=1e-9)
 
 
-def test_place_and_heading_of_the_body_change_no_feature() -> None:
-    truth, hidden = walking(), occlusions(1, 0)
-    turn = yaw_matrix(2.0)
-    there = asked_of(truth @ turn.T + (3.0, -2.0, 0.5), hidden)
-    for a, b in zip(asked_of(truth, hidden), there, strict=True):
-        np.testing.assert_allclose(a.features, b.features, atol=2e-4)
-
-
 def test_of_a_frame_lost_whole_nothing_is_asked() -> None:
     truth, hidden = walking(), np.zeros((FRAMES, 1, 22), dtype=bool)
     hidden[10:12] = True
