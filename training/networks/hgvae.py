@@ -49,7 +49,7 @@ class Gaussian(NamedTuple):
     mean: Tensor
     log_var: Tensor
 
-    def sample(self, spread: Tensor) -> Tensor:
+    def sample(self, spread: Tensor | float = 1.0) -> Tensor:
         """Draw a sample by the reparametrisation trick, with ``spread`` times the standard deviation."""
         return self.mean + spread * torch.randn_like(self.mean) * (0.5 * self.log_var).exp()
 
@@ -70,9 +70,11 @@ class HGVAEOutput(NamedTuple):
     tracks: Gaussian
     """p(x | z), mean and log-variance (B, N, T), in units of `SCALE`"""
     kl: Tensor
-    """(B, L) KL(q || p) of each level, top first"""
+    """(B, L) KL(q || p) of each level, top first; 0 if a level is off"""
     log_prior: Tensor
     """(B, L) log p(m | above) at the posterior's means m, the terms of the score of section 7"""
+    top: Tensor
+    """(B, latent) the top level's posterior mean"""
 
 
 class HGVAE(nn.Module):
@@ -97,7 +99,8 @@ class HGVAE(nn.Module):
             below = level.nodes
         self.start = nn.Parameter(torch.zeros(nodes, features))
         self.down = nn.ModuleList(
-            DecoderLevel(nodes, features, level, top=k == 0) for k, level in enumerate(config.levels)
+            DecoderLevel(nodes, features, level, top=k == 0, extra=config.actions if k == 0 else 0)
+            for k, level in enumerate(config.levels)
         )
         self.last_block = GraphBlock(nodes, features)
         self.write = GraphLinear(nodes, nodes, features, 2 * config.coefficients)
@@ -121,7 +124,9 @@ class HGVAE(nn.Module):
         completed, log_var = self.completion.complete(x, observed, bias_sigma)
         return completed, certainty_of(observed, log_var)
 
-    def forward(self, x: Tensor, certainty: Tensor, *, spread: Tensor | None = None) -> HGVAEOutput:
+    def forward(
+        self, x: Tensor, certainty: Tensor, *, spread: Tensor | None = None, action: Tensor | None = None
+    ) -> HGVAEOutput:
         """Encode and decode windows.
 
         Args:
@@ -129,6 +134,7 @@ class HGVAE(nn.Module):
             certainty: (B, N, T) certainty of each entry, 0 to 1; 1 where observed (see `completion.certainty_of`).
             spread: (B, 1) share of the posterior's standard deviation with which latents are drawn: 1 to draw them, 0
                 or None for the means.
+            action: (B, actions) one-hot, for a model with actions.
         """
         read = torch.cat([x @ self.dct.T, certainty], dim=-1).transpose(0, 1)
         graph = self.read_block(F.gelu(self.read(read)))
@@ -137,23 +143,56 @@ class HGVAE(nn.Module):
             graph = block(up(graph))
             encoded.append(graph)
         stream = self.start[:, None].expand(-1, x.shape[0], -1)
-        kl, log_prior = [], []
-        for level, seen in zip(self.decoder_levels, reversed(encoded), strict=True):
-            prior, posterior = level.prior(stream), level.posterior(stream, seen)
+        kl, log_prior, top = [], [], None
+        off = len(self.down) - (len(self.down) if self.config.stochastic is None else self.config.stochastic)
+        for k, (level, seen) in enumerate(zip(self.decoder_levels, reversed(encoded), strict=True)):
+            prior = level.prior(stream)
+            if k < off:
+                stream = level.add(stream, prior.mean, action)
+                kl.append(x.new_zeros(x.shape[0]))
+                log_prior.append(x.new_zeros(x.shape[0]))
+                continue
+            posterior = level.posterior(stream, seen)
             kl.append(posterior.kl(prior).sum(dim=(0, 2)))
             log_prior.append(prior.log_density(posterior.mean).sum(dim=(0, 2)))
-            stream = level.add(stream, posterior.mean if spread is None else posterior.sample(spread))
+            if k == 0:
+                top = posterior.mean[0]
+            stream = level.add(stream, posterior.mean if spread is None else posterior.sample(spread), action)
+        tracks = self._decode(stream)
+        if top is None:
+            top = x.new_zeros(x.shape[0], self.config.levels[0].latent)
+        return HGVAEOutput(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1), top)
+
+    def generate(
+        self, count: int, *, random_levels: int | None = None, top: Tensor | None = None, action: Tensor | None = None
+    ) -> Gaussian:
+        """Decode tracks (count, N, T) from the prior.
+
+        Args:
+            count: number of samples.
+            random_levels: number of levels, from the top, whose latents are drawn; those below are their prior's means
+                (figure 6). None draws all.
+            top: (count, latent) the top latent, if given; counts as drawn.
+            action: (count, actions) one-hot, for a model with actions.
+        """
+        stream = self.start[:, None].expand(-1, count, -1)
+        for k, level in enumerate(self.decoder_levels):
+            prior = level.prior(stream)
+            drawn = prior.sample() if random_levels is None or k < random_levels else prior.mean
+            stream = level.add(stream, top[None] if k == 0 and top is not None else drawn, action)
+        return self._decode(stream)
+
+    def _decode(self, stream: Tensor) -> Gaussian:
         mean, log_var = self.write(self.last_block(stream)).transpose(0, 1).chunk(2, dim=-1)
-        tracks = Gaussian(mean @ self.dct, (log_var @ self.dct + TRACK_LOG_VAR).clamp(*LOG_VAR_RANGE))
-        return HGVAEOutput(tracks, torch.stack(kl, dim=1), torch.stack(log_prior, dim=1))
+        return Gaussian(mean @ self.dct, (log_var @ self.dct + TRACK_LOG_VAR).clamp(*LOG_VAR_RANGE))
 
 
 class DecoderLevel(nn.Module):
     """One stochastic level of the decoder (figure 2)."""
 
-    def __init__(self, nodes: int, features: int, level: Level, *, top: bool) -> None:
+    def __init__(self, nodes: int, features: int, level: Level, *, top: bool, extra: int) -> None:
         super().__init__()
-        self.level, self.top = level, top
+        self.level, self.top, self.extra = level, top, extra
         same = level.nodes == nodes
         self.contract = nn.Identity() if same else GraphLinear(nodes, level.nodes, features, features)
         self.join = nn.Linear(2 * features, features)
@@ -162,7 +201,7 @@ class DecoderLevel(nn.Module):
         if not top:
             self.prior_block = GraphBlock(level.nodes, features)
             self.prior_head = nn.Linear(features, 2 * level.latent)
-        self.expand = GraphLinear(level.nodes, nodes, level.latent, features)
+        self.expand = GraphLinear(level.nodes, nodes, level.latent + extra, features)
         self.block = GraphBlock(nodes, features)
         with torch.no_grad():  # little noise at first: sampled at every level, noise would hide the signal
             self.expand.weight.mul_(INITIAL_LATENT_GAIN)
@@ -180,8 +219,12 @@ class DecoderLevel(nn.Module):
         joined = self.join(torch.cat([self.contract(stream), seen], dim=-1))
         return _heads(self.posterior_head(self.posterior_block(joined)))
 
-    def add(self, stream: Tensor, z: Tensor) -> Tensor:
+    def add(self, stream: Tensor, z: Tensor, action: Tensor | None) -> Tensor:
         """Return the stream with this level's latent added."""
+        if self.extra:
+            if action is None:
+                raise ValueError(f"expected an action, one-hot (B, {self.extra})")
+            z = torch.cat([z, action[None]], dim=-1)
         return self.block(stream + self.expand(z))
 
 

@@ -120,6 +120,15 @@ def test_normal_densities_and_divergences_are_torchs() -> None:
     assert torch.allclose(ours.kl(other), torch.distributions.kl_divergence(p, q), atol=1e-5)
 
 
+def test_levels_turned_off_cost_nothing_and_carry_nothing() -> None:
+    model = awake(replace(SMALL, stochastic=1))
+    x, observed = torch.randn(4, 66, 12), torch.ones(4, 66, 12)
+    found = model(x, observed)
+    assert (found.kl[:, :2] == 0).all()
+    assert (found.kl[:, 2] > 0).all()
+    assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in HGVAE(SMALL).parameters())
+
+
 def test_the_same_window_is_scored_alike_and_samples_differ() -> None:
     model = awake()
     x, observed = torch.randn(2, 66, 12), torch.ones(2, 66, 12)
@@ -128,6 +137,18 @@ def test_the_same_window_is_scored_alike_and_samples_differ() -> None:
     assert not torch.equal(*drawn)
     still = model(x, observed, spread=torch.tensor([[0.0], [1.0]])).tracks.mean
     assert torch.allclose(still[0], model(x, observed).tracks.mean[0], atol=1e-6)
+
+
+def test_generation_draws_as_many_levels_as_asked() -> None:
+    model = awake(replace(SMALL, actions=3))
+    action = torch.eye(3)
+    torch.manual_seed(1)
+    mean = model.generate(3, random_levels=0, action=action).mean
+    assert torch.equal(mean, model.generate(3, random_levels=0, action=action).mean)
+    assert not torch.allclose(mean[0], mean[1])
+    assert not torch.equal(mean, model.generate(3, random_levels=1, action=action).mean)
+    with pytest.raises(ValueError, match="one-hot"):
+        model.generate(1)
 
 
 def test_the_live_model_is_the_trained_one_and_a_window_does_not_depend_on_the_others() -> None:
