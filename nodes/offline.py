@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +23,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.key_points import in_sight
 from steadypose.prior.complete.body import Fill, Uncertainty
 from steadypose.prior.complete.parts import PartsCompleter
-from steadypose.prior.complete.stream import Completion, along_paths, complete_raws
+from steadypose.prior.complete.stream import Completion, along_paths, alternative, complete_raws
 from steadypose.prior.models.completer import LiveCompleter
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.world.pipeline import TrajectoryPipeline
@@ -76,7 +77,6 @@ def complete_source(
     fill: Fill,
     uncertainty: Uncertainty,
     advanced: Callable[[int, int], None] = lambda frames, total: None,
-    seed: int | None = None,
 ) -> CompletedSource:
     """Complete a source. The other arguments are those of `complete_raws`.
 
@@ -87,16 +87,28 @@ def complete_source(
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
         raise LaunchError(f"{frames.path}: expected frames, but none of {len(frames)} could be read")
-    completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, advanced, seed)
+    completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, advanced)
+    answers, counters = _answered(completion)
+    refused = {cause: n for cause, n in (frames.refused + counters).items() if n}
+    bodies = frames.bodies if isinstance(frames, ArraySource) else ()
+    problems = [text for text in _problems(raws) if not text.startswith("root_relative")]  # `complete` is for those too
+    return CompletedSource(raws, answers, completion, refused, problems, bodies)
+
+
+def alternative_of(completed: CompletedSource, uncertainty: Uncertainty, seed: int) -> CompletedSource:
+    """Draw another completion of the same source with a random seed."""
+    completion = alternative(completed.completion, completed.raws[:-1], uncertainty, seed)
+    return completed._replace(completion=completion, answers=_answered(completion)[0])
+
+
+def _answered(completion: Completion) -> tuple[list[tuple[str, Message]], Counter[str]]:
+    """Return a completion's ``pose/clean`` and ``pose/world`` with their topics, and what the latter refused."""
     settings = TrajectorySettings()
     world, answers = TrajectoryPipeline(settings), list[tuple[str, Message]]()
     for message, moved in zip(completion.clean, along_paths(completion, settings.weights), strict=True):
         answers.append((POSE_CLEAN, message))
         answers += [(POSE_WORLD, answer) for answer in world.process(moved)]
-    refused = {cause: n for cause, n in (frames.refused + world.counters).items() if n}
-    bodies = frames.bodies if isinstance(frames, ArraySource) else ()
-    problems = [text for text in _problems(raws) if not text.startswith("root_relative")]  # `complete` is for those too
-    return CompletedSource(raws, answers, completion, refused, problems, bodies)
+    return answers, world.counters
 
 
 def _problems(raws: Sequence[PoseRaw]) -> list[str]:

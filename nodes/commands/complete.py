@@ -19,7 +19,7 @@ from steadypose.nodes.commands.output import (
 )
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.threads import one_thread
-from steadypose.nodes.offline import CompletedSource, complete_source, load_completer
+from steadypose.nodes.offline import alternative_of, complete_source, load_completer
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.plot.figure import PICTURES, draw_completion, save
 from steadypose.nodes.sources.recording import NO_RIG, open_recording
@@ -92,20 +92,15 @@ def complete(
     terminal = console()
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
-
-        def completion_of(seed: int | None) -> CompletedSource:
-            return complete_source(
-                open_recording(source, read_toml(rig) if rig else NO_RIG),
-                fill,
-                uncertainty,
-                lambda frames, total: progress.update(bar, completed=frames, total=total),
-                seed=seed,
-            )
-
-        completed = completion_of(None)
+        completed = complete_source(
+            open_recording(source, read_toml(rig) if rig else NO_RIG),
+            fill,
+            uncertainty,
+            lambda frames, total: progress.update(bar, completed=frames, total=total),
+        )
         write_output(out, completed.arrays, completed.messages)
         for seed, other in alternatives.items():
-            drawn = completion_of(seed)
+            drawn = alternative_of(completed, uncertainty, seed)
             write_output(other, drawn.arrays, drawn.messages)
     completion = completed.completion
     people = len({stretch.body for stretch, _ in completion.done})

@@ -266,10 +266,13 @@ def complete(
     Warns:
         InputWarning: as in `clean`.
     """
-    from steadypose.nodes.offline import complete_source, load_completer
+    from steadypose.nodes.offline import alternative_of, complete_source, load_completer
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    completed = complete_source(source, *load_completer(weights), seed=seed)
+    fill, uncertainty = load_completer(weights)
+    completed = complete_source(source, fill, uncertainty)
+    if seed is not None:
+        completed = alternative_of(completed, uncertainty, seed)
     warn(completed.problems)
     return Poses(completed.arrays(), completed.problems, completed.refused)
 

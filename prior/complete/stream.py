@@ -91,7 +91,6 @@ def complete_raws(
     fill: Fill,
     uncertainty: Uncertainty,
     advanced: Callable[[int, int], None] = lambda frames, total: None,
-    seed: int | None = None,
 ) -> Completion:
     """Complete the bodies of a recording.
 
@@ -101,7 +100,6 @@ def complete_raws(
         fill: a completer.
         uncertainty: standard deviations of its output.
         advanced: called with the numbers of finished frames and of all, of all bodies together.
-        seed: if given, an alternative is drawn with it (`samples.draw`).
 
     Raises:
         CompletionError: the recording has an unknown skeleton, no body, or no body in metres.
@@ -112,17 +110,24 @@ def complete_raws(
     done: list[tuple[Stretch, Completed]] = []
     before, total = 0, sum(len(stretch.given) for stretch in stretches)
     advanced(before, total)
-    random = np.random.default_rng(seed)
     for stretch in stretches:
         completed = complete(fill, stretch.given, stretch.offsets, lambda k, at=before: advanced(at + k, total))
-        if seed is not None:
-            covariance = uncertainty.posture.covariance
-            completed = draw(completed, uncertainty.of(stretch.given), stretch.offsets, covariance, random)
         done.append((stretch, completed))
         before += len(stretch.given)
         advanced(before, total)
     centred = sorted({stretch.body for stretch, _ in done if is_root_centred(stretch.given)})
     return Completion(anchor_ns, done, _clean_messages(raws, done, uncertainty, anchor_ns), centred)
+
+
+def alternative(completion: Completion, raws: Sequence[PoseRaw], uncertainty: Uncertainty, seed: int) -> Completion:
+    """Draw another completion of the same messages with a random seed (`samples.draw`)."""
+    random, covariance = np.random.default_rng(seed), uncertainty.posture.covariance
+    done = [
+        (stretch, draw(completed, uncertainty.of(stretch.given), stretch.offsets, covariance, random))
+        for stretch, completed in completion.done
+    ]
+    raws = sorted(raws, key=lambda message: message.stamp_ns)
+    return replace(completion, done=done, clean=_clean_messages(raws, done, uncertainty, completion.anchor_ns))
 
 
 def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Stretch]:
