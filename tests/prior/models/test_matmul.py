@@ -42,7 +42,7 @@ def test_a_row_does_not_depend_on_the_others(rows: int) -> None:
 @pytest.mark.parametrize("change", [lambda m: m.astype(float), np.asfortranarray, lambda m: m[None]])
 def test_other_arrays_are_refused(matrix: int, change) -> None:
     """The instructions read memory as float32 row by row, whatever it holds."""
-    arrays = [*matrices(20, 20, 20, 0), np.empty((20, 20), dtype=np.float32)]
+    arrays = [*matrices(20, 20, 20, 0), np.zeros((20, 20), dtype=np.float32)]
     arrays[matrix] = change(arrays[matrix])
     with pytest.raises(TypingError):
         multiply(*arrays)
@@ -51,7 +51,7 @@ def test_other_arrays_are_refused(matrix: int, change) -> None:
 @pytest.mark.parametrize("matrix", range(4))
 @pytest.mark.parametrize("axis", [0, 1])
 def test_matrices_that_do_not_fit_are_refused(matrix: int, axis: int) -> None:
-    arrays = [*matrices(20, 20, 20, 0), np.empty((20, 20), dtype=np.float32)]
+    arrays = [*matrices(20, 20, 20, 0), np.zeros((20, 20), dtype=np.float32)]
     arrays[matrix] = np.ascontiguousarray(arrays[matrix].take(range(19), axis))
     with pytest.raises(ValueError, match="multiply: expected"):
         multiply(*arrays)
