@@ -3,6 +3,7 @@
 import datetime
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -116,11 +117,16 @@ def readings(up: Sequence[float]) -> dai.IMUData:
     return message
 
 
+SOON_S = 30.0
+"""Longest wait for a thread of depthai, seconds."""
+
+
 class Player(dai.node.ThreadedHostNode):
     """In the place of the camera's nodes: sends each message it is given on its output, in order.
 
     Attributes:
         outputs: ``detections``, ``depth``, ``colour`` and ``imu``.
+        levelled: whether the readings of the IMU have been read, for which the messages after them wait.
     """
 
     def __init__(self) -> None:
@@ -135,11 +141,16 @@ class Player(dai.node.ThreadedHostNode):
             )
         }
         self.script: list[tuple[str, dai.Buffer]] = []
+        self.levelled: Callable[[], bool] = lambda: True
         self.done = threading.Event()
 
     def run(self) -> None:
         for name, message in self.script:
             self.outputs[name].send(message)
+            if name == "imu":  # another thread reads it than reads images
+                late = time.monotonic() + SOON_S
+                while not self.levelled() and time.monotonic() < late:
+                    time.sleep(0.001)
         self.done.set()
 
 
@@ -179,6 +190,7 @@ def plugged(
         imu = None if imu_to_camera is None else (player.outputs["imu"], imu_to_camera)
         images = (player.outputs["colour"], writer) if writer else None
         host = Host(pipeline, player.outputs["detections"], player.outputs["depth"], imu, "oak-test", clock, images)
+        player.levelled = lambda: imu is None or host.level.measured
         pipeline.start()
         thread = threading.Thread(target=unplug, args=(pipeline, player)) if unplug else None
         if thread:
