@@ -154,6 +154,8 @@ def definitions(path: Path) -> list[str]:
                 | ast.AnnAssign(target=ast.Name(id=name))
             ):
                 pass
+            case ast.Assign(targets=[ast.Tuple() as names]):
+                name = ast.unparse(names)
             case _:
                 continue
         if name == "DEPENDS_ON":

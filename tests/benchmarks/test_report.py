@@ -172,20 +172,22 @@ def test_the_outputs_root_mean_square_change_tells_whether_it_is_the_same(monkey
 
 def test_only_what_changes_figures_counts_as_code(tmp_path: Path) -> None:
     texts = [
-        "X = 1\n\n\ndef f(x):\n    return x\n",
-        '"""Text."""\nimport os\nX = 1  # a comment\n"""Metres."""\n'
+        "X = 1\nY, Z = 2, 3\n\n\ndef f(x):\n    return x\n",
+        '"""Text."""\nimport os\nX = 1  # a comment\n"""Metres."""\nY, Z = 2, 3\n'
         'def f(x: int) -> int:\n    """Text."""\n    return x\n'
         "def table() -> Table:\n    return Table()\n",
-        "def f(x):\n    return x\nX = 1\n",
-        "X = 2\n\n\ndef f(x):\n    return x\n",
-        "X = 1\n\n\ndef f(x):\n    return -x\n",
+        "Y, Z = 2, 3\ndef f(x):\n    return x\nX = 1\n",
+        "X = 2\nY, Z = 2, 3\n\n\ndef f(x):\n    return x\n",
+        "X = 1\nY, Z = 2, 3\n\n\ndef f(x):\n    return -x\n",
+        "X = 1\nY, Z = 2, 4\n\n\ndef f(x):\n    return x\n",
     ]
     found = []
     for number, text in enumerate(texts):
         (tmp_path / f"{number}.py").write_text(text)
         found.append(sorted(definitions(tmp_path / f"{number}.py")))
     assert found[0] == found[1] == found[2]
-    assert [[line.split()[0] for line in set(found[0]) - set(other)] for other in found[3:]] == [["X"], ["f"]]
+    changed = [[line.rpartition(" ")[0] for line in set(found[0]) - set(other)] for other in found[3:]]
+    assert changed == [["X"], ["f"], ["(Y, Z)"]]
 
 
 def test_every_study_says_what_it_depends_on_and_is_made_of_code() -> None:
