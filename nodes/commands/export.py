@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 from rich.progress import Progress
 
+from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.commands.output import (
@@ -128,7 +129,8 @@ def retarget(
     """
     check_file(source, out, ARRAY_FILES, replace=force)
     if urdf is None:
-        raise LaunchError("expected --urdf FILE, the robot's; launch/robots/humanoid29.urdf is one to try with")
+        example = PACKAGE / "launch" / "robots" / "humanoid29.urdf"
+        raise LaunchError(f"expected --urdf FILE, the robot's; {example} is one to try with")
     require_extra("retarget")
     from steadypose.nodes.sinks.retarget import Follower, Retargeter
     from steadypose.nodes.sinks.robot import load_robot

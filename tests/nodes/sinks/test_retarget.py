@@ -311,4 +311,6 @@ def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFi
     assert "--force to replace it" in capsys.readouterr().err
     assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.bvh"), *given]) == 2
     assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out2.csv")]) == 2
-    assert "expected --urdf FILE" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "expected --urdf FILE" in said
+    assert str(URDF) in said, "which is there wherever the package is installed"
