@@ -177,7 +177,7 @@ class Manifest:
                 with self.path.open("a", encoding="utf-8") as file:
                     file.write("\n")
             for line in text.splitlines():
-                with suppress(ValueError):  # of the line that was cut short
+                with suppress(ValueError, KeyError, TypeError, RecursionError):  # a line cut short, or spoilt
                     entry = json.loads(line)
                     self._known[entry["input"]] = entry
         elif out.exists() and any(out.iterdir()):

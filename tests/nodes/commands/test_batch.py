@@ -95,12 +95,13 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, here: list[Job], monkeyp
     assert len(here) == 4, "other models, other results"
 
 
-def test_the_last_line_cut_short_does_not_spoil_the_next(tmp_path: Path, here: list[Job]) -> None:
+@pytest.mark.parametrize("line", ['{"input": "a.npz", "sta', '{"input": ["a.npz"]}', '{"input": ' + 100_000 * "["])
+def test_a_line_cut_short_or_spoilt_does_not_spoil_the_next(tmp_path: Path, here: list[Job], line: str) -> None:
     source, out = tmp_path / "in", tmp_path / "out"
     source.mkdir()
     out.mkdir()
     write_npz(source / "a.npz", WALK)
-    (out / "manifest.jsonl").write_text('{"input": "a.npz", "sta')
+    (out / "manifest.jsonl").write_text(line)
     assert clean(source, out) == 0
     here.clear()
     assert clean(source, out) == 0
