@@ -1,4 +1,4 @@
-"""Live inference of graph networks without torch: compiled loops over two kinds of matrix steps.
+"""Live inference of graph and attention networks without torch: compiled loops over four kinds of matrix steps.
 
 In torch, overhead dominates networks of this size: 250 small operations take ten times as long as their arithmetic.
 Here, a network is recorded once as a list of steps (`Program`), and compiled loops run it (`Network`).
@@ -22,9 +22,12 @@ LOG_VAR_RANGE = (-10.0, 3.0)
 """Range of log-variances, in units of `prior.models.hgvae.config.SCALE`; standard deviations are 1.3 mm to 0.9 m."""
 
 # Steps: the kind, the matrix written, the matrix read, and further fields by kind (see `_do`).
-_LINEAR, _GELU = range(2)
+_LINEAR, _GELU, _NORM, _ATTEND = range(4)
 _FIELDS = 8
 _NONE = -1
+
+_NORM_EPSILON = np.float32(1e-5)
+"""Variance added in a layer normalisation, torch's default."""
 
 
 class Program:
@@ -93,6 +96,20 @@ class Program:
             self.block(graph, block, onto=graph)
             k += 1
         return graph
+
+    def attention(self, of: int, layer: Arrays, heads: int) -> int:
+        """Add an `AttentionLayer` with these weights, without biases of its scores, in place."""
+        read = self.normed(of, part(layer, "norm1"), part(layer, "attend"))
+        joined = self._step(_ATTEND, self.matrix(*self.shapes[of]), read, heads)
+        self.linear(joined, layer["join.weight"].T, layer["join.bias"], plus=of, onto=of)
+        wide = self.normed(of, part(layer, "norm2"), part(layer, "widen"))
+        return self.linear(wide, layer["narrow.weight"].T, layer["narrow.bias"], plus=of, onto=of, active=True)
+
+    def normed(self, of: int, norm: Arrays, linear: Arrays) -> int:
+        """Add a layer normalisation and the linear layer that follows it, which includes its scale and shift."""
+        normed = self._step(_NORM, self.matrix(*self.shapes[of]), of)
+        weight, shift = linear["weight"], (linear["weight"] @ norm["bias"]).astype(np.float32)
+        return self.linear(normed, (weight * norm["weight"]).T, linear["bias"] + shift)
 
     def gelu(self, of: int) -> int:
         """Add a GELU of a matrix, written to a new matrix."""
@@ -165,6 +182,51 @@ def _copy(values, out):
         out[k] = values[k]
 
 
+@njit(cache=True, fastmath=True)
+def _norm(values, out):
+    """Write each row less its mean, over its standard deviation."""
+    width = values.shape[1]
+    for row in range(len(values)):
+        mean = square = np.float32(0)
+        for k in range(width):
+            mean += values[row, k]
+        mean /= np.float32(width)
+        for k in range(width):
+            square += (values[row, k] - mean) ** 2
+        scale = _ONE / np.sqrt(square / np.float32(width) + _NORM_EPSILON)
+        for k in range(width):
+            out[row, k] = scale * (values[row, k] - mean)
+
+
+@njit(cache=True, fastmath=True)
+def _attend(read, heads, out):
+    """Write the attention of rows (n, f), given their queries, keys and values (n, 3 f), which ``heads`` share."""
+    nodes, width = out.shape
+    size = width // heads
+    scale = _ONE / np.sqrt(np.float32(size))
+    scores = np.empty(nodes, dtype=np.float32)
+    for head in range(heads):
+        query, key, value = head * size, width + head * size, 2 * width + head * size
+        for row in range(nodes):
+            most = np.float32(-np.inf)
+            for other in range(nodes):
+                score = np.float32(0)
+                for k in range(size):
+                    score += read[row, query + k] * read[other, key + k]
+                scores[other] = scale * score
+                most = max(most, scores[other])
+            total = np.float32(0)
+            for other in range(nodes):
+                scores[other] = np.exp(scores[other] - most)
+                total += scores[other]
+            for k in range(size):
+                out[row, query + k] = 0
+            for other in range(nodes):
+                share = scores[other] / total
+                for k in range(size):
+                    out[row, query + k] += share * read[other, value + k]
+
+
 @njit(cache=True)
 def _view(arena, shapes, starts, number):
     nodes, features = shapes[number]
@@ -214,6 +276,10 @@ def _do(step, shapes, starts, weights, values, scratch, nothing):
         if plus != _NONE:
             _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())
         _copy(product.ravel(), out.ravel())
+    elif step[0] == _NORM:
+        _norm(a, out)
+    elif step[0] == _ATTEND:
+        _attend(a, step[3], out)
     else:
         _, _, _, factor, plus = step[:5]
         activated = scratch[0, : a.size]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J, limbs
 from steadypose.prior.sim.noise import time_correlated
 from steadypose.prior.timing.rate import FPS
@@ -176,8 +176,9 @@ def jumps(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rn
 def occlude(positions: Floats, rng: Rng) -> Floats:
     """Hide joints (NaN) of windows (B, T, 22, 3) in the way that cameras lose them.
 
-    It hides limbs, the lower body, subtrees, random sets of joints, single entries, joints that a sensor lacks, and all
-    frames before a body entered. Half of the gaps reach the newest frame, which matters most.
+    It hides limbs, the lower body, subtrees, what lies below a counter or beyond an edge of the picture, random sets of
+    joints, single entries, joints that a sensor lacks, and all frames before a body entered. Half of the gaps reach the
+    newest frame, which matters most.
     """
     seen = positions.copy()
     frames = positions.shape[1]
@@ -188,15 +189,19 @@ def occlude(positions: Floats, rng: Rng) -> Floats:
             window[:, 1 + rng.choice(len(PARENTS) - 1, rng.integers(1, 7), replace=False)] = np.nan
         for _ in range(rng.integers(1, 4)):
             kind = rng.random()
-            joints = (
-                _LIMBS[rng.integers(len(_LIMBS))] if kind < 0.6
-                else _LOWER if kind < 0.7
-                else _below(int(rng.integers(1, len(PARENTS)))) if kind < 0.8
-                else np.flatnonzero(rng.random(len(PARENTS)) < rng.uniform(0.05, 0.5))
-            )  # fmt: skip
             length = int(np.clip(np.exp(rng.uniform(np.log(2), np.log(2.0 * frames))), 1, frames))
             start = frames - length if rng.random() < 0.5 else int(rng.integers(0, frames - length + 1))
-            window[start : start + length, joints] = np.nan
+            gap = window[start : start + length]
+            if kind < 0.15:
+                gap[_beyond_an_edge(window, rng)[start : start + length]] = np.nan
+                continue
+            joints = (
+                _LIMBS[rng.integers(len(_LIMBS))] if kind < 0.65
+                else _LOWER if kind < 0.75
+                else _below(int(rng.integers(1, len(PARENTS)))) if kind < 0.85
+                else np.flatnonzero(rng.random(len(PARENTS)) < rng.uniform(0.05, 0.5))
+            )  # fmt: skip
+            gap[:, joints] = np.nan
         if rng.random() < 0.2:
             window[rng.random(window.shape[:2]) < 10 ** rng.uniform(-3, -0.3)] = np.nan
         if rng.random() < 0.15:
@@ -208,6 +213,15 @@ def hide_joints(positions: Floats, count: int, rng: Rng) -> Floats:
     """Set ``count`` random joints of each window (B, T, 22, 3) to NaN in all frames."""
     hidden = rng.permuted(np.tile(np.arange(22) < count, (len(positions), 1)), axis=1)
     return np.where(hidden[:, None, :, None], np.nan, positions)
+
+
+def _beyond_an_edge(window: Floats, rng: Rng) -> Bools:
+    """(T, 22) which joints of a window (T, 22, 3) lie below a level or beyond a vertical plane, 5 to 75 %."""
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    outwards = [0.0, 0.0, -1.0] if rng.random() < 0.7 else [np.cos(turn), np.sin(turn), 0.0]
+    distance = window @ np.array(outwards)
+    known = distance[np.isfinite(distance)]
+    return np.asarray(distance > (np.quantile(known, rng.uniform(0.25, 0.95)) if len(known) else np.inf))
 
 
 def _below(joint: int) -> list[int]:

@@ -22,6 +22,10 @@ from steadypose.prior.models.hgvae.live_completion import (
     completion_features,
 )
 from steadypose.prior.models.weights import weights_path
+from steadypose.training.networks.attention import AttentionLayer
+
+DROPOUT = 0.05
+"""Share of the outputs of the completion network's layers that training drops."""
 
 
 class GraphLinear(nn.Module):
@@ -90,12 +94,17 @@ class CompletionNet(nn.Module):
         if frames % config.patch:
             raise ValueError(f"expected frames in whole patches of {config.patch}, got {frames}")
         self.config = config
-        nodes, features = frames // config.patch, config.features
-        self.read = GraphLinear(nodes, nodes, FRAME_INPUTS * config.patch + WINDOW_INPUTS, features)
-        self.blocks = nn.Sequential(*(GraphBlock(nodes, features) for _ in range(config.blocks)))
-        self.write = GraphLinear(nodes, nodes, features, (JOINT_NODES + JOINTS) * config.patch)
-        with torch.no_grad():
-            self.write.weight.mul_(0.1)  # start near the interpolation
+        width = config.width
+        self.read = nn.Linear(FRAME_INPUTS * config.patch + WINDOW_INPUTS, width)
+        self.place = nn.Parameter(torch.zeros(frames // config.patch, width))
+        self.layers = nn.Sequential(
+            *(AttentionLayer(width, config.heads, 2 * width, dropout=DROPOUT) for _ in range(config.layers))
+        )
+        self.norm = nn.LayerNorm(width)
+        self.write = nn.Linear(width, (JOINT_NODES + JOINTS) * config.patch)
+        with torch.no_grad():  # start near the interpolation
+            self.write.weight.mul_(0.1)
+            self.write.bias.zero_()
 
     def forward(self, nodes: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
         """Return correction (B, 66, T) and log-variance of the corrected joint (B, 22, T), in units of `SCALE`.
@@ -104,8 +113,7 @@ class CompletionNet(nn.Module):
             nodes: (B, T / patch, inputs), see `Features`.
             line_variance: (B, 22, T) variance of the interpolation, `Features.line_variance`.
         """
-        written = self.write(self.blocks(F.gelu(self.read(nodes.transpose(0, 1))))).transpose(0, 1)
-        return self.fuse(written, line_variance)
+        return self.fuse(self.write(self.norm(self.layers(self.read(nodes) + self.place))), line_variance)
 
     def fuse(self, written: Tensor, line_variance: Tensor) -> tuple[Tensor, Tensor]:
         """Compute `forward` from the last layer's output ``written`` (B, T / patch, 88 patch).

@@ -11,7 +11,6 @@ between key frames, parts of the body, and combinations of these. In some window
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,6 +51,7 @@ from steadypose.training.data.dataset import (
     mirror_rotations,
 )
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
+from steadypose.training.networks.attention import AttentionLayer
 from steadypose.training.weights import arrays_of
 
 
@@ -62,7 +62,11 @@ class Completer(nn.Module):
         super().__init__()
         self.config = config
         self.read = nn.Linear(FEATURES, config.width)
-        self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
+        width, reach = config.width, config.reach
+        self.layers = nn.ModuleList(
+            AttentionLayer(width, config.heads, 4 * width, reach=reach, approximate="tanh")
+            for _ in range(config.layers)
+        )
         self.norm = nn.LayerNorm(config.width)
         self.write = nn.Linear(config.width, OUTPUTS)
         # (22, 4) local quaternions, xyzw, of the mean pose
@@ -75,33 +79,10 @@ class Completer(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, T, OUTPUTS) of features (B, T, FEATURES)."""
-        frames, reach = features.shape[1], self.config.reach
-        at = torch.arange(frames)
-        apart = (at[None] - at[:, None]).clamp(-reach, reach) + reach
         x = self.read(features)
         for layer in self.layers:
-            x = layer(x, apart)
+            x = layer(x)
         return self.write(self.norm(x))
-
-
-class _Layer(nn.Module):
-    """Pre-norm attention with biases of relative position, and a feed-forward network."""
-
-    def __init__(self, config: CompleterConfig) -> None:
-        super().__init__()
-        self.heads = config.heads
-        self.norm1, self.norm2 = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
-        self.attend = nn.Linear(config.width, 3 * config.width)
-        self.join = nn.Linear(config.width, config.width)
-        self.bias = nn.Parameter(torch.zeros(config.heads, 2 * config.reach + 1))
-        self.widen = nn.Linear(config.width, 4 * config.width)
-        self.narrow = nn.Linear(4 * config.width, config.width)
-
-    def forward(self, x: Tensor, apart: Tensor) -> Tensor:
-        query, key, value = self.attend(self.norm1(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        scores = query @ key.mT / math.sqrt(query.shape[-1]) + self.bias[:, apart]
-        x = x + self.join((scores.softmax(dim=-1) @ value).transpose(1, 2).flatten(2))
-        return x + self.narrow(F.gelu(self.widen(self.norm2(x)), approximate="tanh"))
 
 
 ITERATIONS, BATCH, LEARNING_RATE = 4_000, 36_000, 1.2e-3

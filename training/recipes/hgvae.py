@@ -31,6 +31,7 @@ from steadypose.training.data.corruption import (
     vary_builds,
     with_faults,
 )
+from steadypose.training.data.dataset import SpeedWeightedWindows
 from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.graph import CompletionNet
@@ -38,8 +39,8 @@ from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
 from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
 
-ITERATIONS, COMPLETION_BATCH = 9_000, 128
-"""Number of steps; windows per step of the completion network."""
+ITERATIONS = 9_000
+"""Number of steps."""
 
 FAULTS = (stands_still, exchanged, displaced)
 FAULT_SHARE = 0.3
@@ -50,7 +51,10 @@ BONE_SIGMA, TURN_SIGMA = 0.05, 0.2
 radians. There are only 22 people to train on."""
 
 
-COMPLETION_RATE = 2e-3
+COMPLETION_ITERATIONS, COMPLETION_BATCH, COMPLETION_AVERAGE = 14_000, 1_024, 0.998
+"""Of the completion network: number of steps, windows per step, and decay of the average of its parameters."""
+
+COMPLETION_RATE = 8e-4
 """Initial learning rate of the completion network; half of it if it starts from trained weights."""
 
 
@@ -58,14 +62,21 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
     """Return the recipe of ``model.completion``, whose loss is the negative log-likelihood of the hidden entries; the
     model's ``mean`` is set.
 
-    Each entry is weighted by its predicted standard deviation (Seitzer et al., "On the Pitfalls of Heteroscedastic
-    Uncertainty Estimation", ICLR 2022, beta = 0.5). Otherwise, entries of small deviation would dominate the gradient.
+    Half of the windows are drawn with weights that grow with speed, and half of these have builds and poses varied
+    further. Each entry is weighted by its predicted standard deviation (Seitzer et al., "On the Pitfalls of
+    Heteroscedastic Uncertainty Estimation", ICLR 2022, beta = 0.5). Otherwise, entries of small deviation would
+    dominate the gradient.
     """
-    network = _network(model)
+    network, fast = _network(model), SpeedWeightedWindows(train.motion)
 
     def loss_of(_: CompletionNet, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
-        clean, sizes = train.draw(count, model.config.frames, rng, STRIDES)
-        clean = vary_builds(clean, BONE_SIGMA, TURN_SIGMA, rng)
+        half, quarter = count // 2, count // 4
+        rows = [train.motion.sample(count - half, model.config.frames, STRIDES, rng)]
+        rows.append(fast.sample(half, model.config.frames, STRIDES, rng))
+        clean, sizes = train.clean(np.concatenate(rows), rng.random(count) < 0.5)
+        builds = [vary_builds(clean[:-quarter], BONE_SIGMA, TURN_SIGMA, rng)]
+        builds.append(vary_builds(clean[-quarter:], 1.4 * BONE_SIGMA, 2 * TURN_SIGMA, rng))
+        clean = np.concatenate(builds)
         bias_sigma = draw_bias_sigma(count, rng)
         seen = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, FAULT_SHARE, rng), rng)
         off, log_var, hidden = _errors(model, seen, clean, sizes, bias_sigma)
@@ -74,8 +85,8 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
         return loss, {"loss": loss.item()}
 
     return Recipe(
-        "hgvae", lambda: network, loss_of, lambda _: evaluate_completion(model, val), ITERATIONS, COMPLETION_BATCH,
-        rate, decay=1e-3, schedule=CosineAnnealingLR, evaluations=20,
+        "hgvae", lambda: network, loss_of, lambda _: evaluate_completion(model, val), COMPLETION_ITERATIONS,
+        COMPLETION_BATCH, rate, decay=1e-2, evaluations=20, average=COMPLETION_AVERAGE,
     )  # fmt: skip
 
 
@@ -153,7 +164,8 @@ def train_hgvae(options: TrainingOptions) -> Path:
     network.mean.copy_(mean_tracks(train, network.config.frames))
     origin = started(network, "hgvae", start)
     completion = completion_recipe(network, train, val, COMPLETION_RATE)
-    completion.minimise(_network(network), options.runs / f"{path.stem}-completion", iterations, seed)
+    steps = options.iterations or completion.iterations
+    completion.minimise(_network(network), options.runs / f"{path.stem}-completion", steps, seed)
     recipe = recipe_of(train, val, RATE if start is None else RATE / 2)
     run = recipe.minimise(network, path.parent, iterations, seed)
     run.save(path, network, asdict(network.config), {
@@ -161,7 +173,7 @@ def train_hgvae(options: TrainingOptions) -> Path:
         "Data": f"the '{weights}' set of `steadypose prepare`, split by subject",
         "Licence": LICENCES[weights],
         "Training": f"`steadypose train hgvae --weights {weights}`: {iterations} steps of {BATCH} windows, "
-        f"after as many of {completion.batch} for its completion network, "
+        f"after {steps} of {completion.batch} for its completion network, "
         f"AdamW {recipe.rate:g}, seed {seed}{origin}",
     })  # fmt: skip
     faults = None if start is None else str(weights_path(start, "hgvae").with_suffix(".faults.safetensors"))
@@ -182,7 +194,7 @@ def train_completion(options: TrainingOptions) -> Path:
     network = HGVAE(CONFIG)
     origin = started(network, "hgvae", start)
     recipe = completion_recipe(network, train, val, COMPLETION_RATE / 2)
-    iterations = options.iterations or ITERATIONS
+    iterations = options.iterations or recipe.iterations
     run = recipe.minimise(_network(network), path.parent, iterations, options.seed)
     for suffix in (".anomaly.json", ".faults.safetensors"):
         shutil.copyfile(weights_path(start, "hgvae").with_suffix(suffix), path.with_suffix(suffix))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from steadypose.prior.models.weights import WeightsError
+
 JOINT_NODES = 66
 """Number of nodes: 22 joints with 3 coordinates each, node ``3 * joint + axis``."""
 
@@ -28,10 +30,12 @@ class CompletionConfig:
 
     patch: int = 5
     """frames in a node; a window consists of whole patches"""
-    features: int = 256
+    width: int = 256
     """number of features of each node"""
-    blocks: int = 4
-    """number of graph convolutional blocks between the input and the output layer"""
+    heads: int = 8
+    """number of attention heads"""
+    layers: int = 5
+    """number of attention layers between the input and the output layer"""
 
 
 @dataclass(frozen=True)
@@ -56,8 +60,10 @@ class HGVAEConfig:
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:
-        """From the JSON of a weights file."""
+        """From the JSON of a weights file; raises WeightsError for an earlier version's."""
         completion = config.get("completion")
+        if completion and "heads" not in completion:
+            raise WeightsError("hgvae: expected a completion network of this version, a transformer: train again")
         return cls(**{
             **config,
             "levels": tuple(Level(*level) for level in config["levels"]),

@@ -223,9 +223,12 @@ class LiveCompletion:
 
     def __init__(self, config: CompletionConfig, weights: Arrays, max_batch: int) -> None:
         p, self._patch = Program(), config.patch
-        nodes, inputs = len(weights["read.adjacency"]), len(weights["read.weight"])
-        self._nodes = p.matrix(nodes, inputs)
-        self._written = p.layer(p.trunk(self._nodes, weights), part(weights, "write"))
+        place, read = weights["place"], weights["read.weight"].T
+        self._nodes = p.matrix(len(place), len(read))
+        graph = p.linear(self._nodes, read, weights["read.bias"] + place)
+        for k in range(config.layers):
+            p.attention(graph, part(weights, f"layers.{k}"), config.heads)
+        self._written = p.normed(graph, part(weights, "norm"), part(weights, "write"))
         self._net = Network(p, max_batch)
 
     def complete(

@@ -64,7 +64,7 @@ def test_how_much_a_joint_moves_is_told_beside_the_one_above_and_without_the_noi
 
 
 def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None:
-    network = CompletionNet(12, CompletionConfig(patch=4, features=8, blocks=1))
+    network = CompletionNet(12, CompletionConfig(patch=4, width=8, heads=2, layers=2))
     written = torch.zeros(1, 3, 88 * 4)
     written[..., : 66 * 4] = 1.0
 

@@ -1,5 +1,5 @@
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models.hgvae.config import CompletionConfig, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.features import from_tracks, hang_unseen, in_frame_of, to_tracks
 from steadypose.prior.models.hgvae.inference import LiveHGVAE
-from steadypose.prior.models.weights import WEIGHTS
+from steadypose.prior.models.weights import WEIGHTS, WeightsError
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.networks.graph import GraphBlock, GraphLinear, load_fault_net
 from steadypose.training.networks.hgvae import HGVAE, Gaussian, dct_matrix
@@ -28,7 +28,7 @@ SMALL = HGVAEConfig(
     coefficients=6,
     features=8,
     levels=(Level(1, 4), Level(5, 3), Level(66, 2)),
-    completion=CompletionConfig(patch=4, features=8, blocks=1),
+    completion=CompletionConfig(patch=4, width=8, heads=2, layers=2),
 )
 
 
@@ -179,6 +179,12 @@ def test_training_writes_weights_their_card_and_their_scale(tmp_path: Path, monk
     assert json.loads(path.with_suffix(".anomaly.json").read_text())["quantiles"]
     assert load_fault_net(str(path)).config.frames == 20
     assert "steadypose train hgvae" in path.with_suffix(".md").read_text()
+
+
+def test_weights_of_an_earlier_completion_network_are_refused() -> None:
+    earlier = {**asdict(SMALL), "completion": {"patch": 4, "features": 8, "blocks": 1}}
+    with pytest.raises(WeightsError, match=r"expected a completion network of this version, .* train again"):
+        HGVAEConfig.from_dict(earlier)
 
 
 def test_the_weights_that_ship_reconstruct_motion_they_never_saw() -> None:

@@ -56,6 +56,17 @@ def test_gaps_are_many_and_reach_the_newest_frame() -> None:
     assert hidden[:, -1].any(axis=1).mean() > 0.5
 
 
+def test_some_gaps_are_what_lies_below_a_level_whichever_joints_these_are() -> None:
+    rng, found = np.random.default_rng(0), 0
+    for window in np.concatenate([WINDOWS] * (200 // len(WINDOWS))):
+        hidden = np.isnan(occlude(window[None], rng)[0, ..., 0])
+        gap = hidden.any(axis=1) & ~hidden.all(axis=1)
+        height, sets = window[gap, :, 2], np.unique(hidden[gap], axis=0)
+        highest_hidden = np.where(hidden[gap], height, -np.inf).max(initial=-np.inf)
+        found += len(sets) > 1 and highest_hidden < np.where(hidden[gap], np.inf, height).min(initial=np.inf)
+    assert found >= 3
+
+
 def test_a_sensor_errs_by_what_is_said_half_of_it_for_good() -> None:
     off = with_sensor_error(WINDOWS, 0.02, np.random.default_rng(0)) - WINDOWS
     assert off.std() == pytest.approx(0.02, rel=0.05)
