@@ -1,8 +1,8 @@
 """Live inference of the completion network (`CompletionNet`) without torch, and its features.
 
-A node is a patch of the window in time. Its inputs are the whole body's tracks, the nearness of each joint's
-observations, and each joint's noise and mobility. The network's output is fused with the interpolation that fills the
-window's gaps (`prior.models.hgvae.features`), weighted by the interpolation's variance.
+The network is a transformer. A node, its token, is a patch of the window in time; its inputs are the whole body's
+tracks, the nearness of each joint's observations, and each joint's noise and mobility. The output is fused with the
+interpolation that fills the window's gaps (`prior.models.hgvae.features`), weighted by the interpolation's variance.
 """
 
 from __future__ import annotations
