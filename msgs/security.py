@@ -27,7 +27,7 @@ from pathlib import Path
 
 
 class TransportError(ValueError):
-    """An address that cannot or must not be used. The text says what to do."""
+    """An address or a key that cannot or must not be used. The text says what to do."""
 
 
 MAX_PORT = 65535
@@ -156,12 +156,15 @@ class Keys:
     """directory that the keys were read from, and in which the clients' are"""
 
     def server_at(self, endpoint: str) -> bytes:
-        """The public key of the publisher at an address. Raises ValueError if there is no key for its host."""
+        """The public key of the publisher at an address. Raises TransportError if there is no key for its host."""
         _, host = parse(endpoint)
         if host in self.servers:
             return self.servers[host]
         if self.servers and not is_local(endpoint):
-            raise ValueError(f"{endpoint}: expected its public key in {self.directory}/servers/{host}.key, found none")
+            expected = self.directory / "servers" / f"{host}.key"
+            raise TransportError(
+                f"{endpoint}: expected its public key in {expected}, found none; copy its own.key there"
+            )
         return self.server
 
     def clients(self) -> set[bytes]:
@@ -169,13 +172,13 @@ class Keys:
         same machine."""
         listed = {self.public}
         for file in (self.directory / "clients").glob("*.key"):
-            with suppress(ValueError, OSError):  # a file that is still being written is ignored
+            with suppress(TransportError, OSError):  # a file that is still being written is ignored
                 listed.add(_public(file))
         return listed
 
 
 def _listed(directory: Path) -> dict[str, bytes]:
-    """Public keys in a folder, by file name without suffix. Raises ValueError if a file is not a key."""
+    """Public keys in a folder, by file name without suffix. Raises TransportError if a file is not a key."""
     return {file.stem: _public(file) for file in sorted(directory.glob("*.key"))}
 
 
@@ -187,10 +190,13 @@ def _certificate(file: Path) -> tuple[bytes, bytes | None]:
     """The public key in a file, and the secret key if the file has one."""
     from zmq.auth import load_certificate  # imported late, because parsing an address needs no ZeroMQ
 
-    public, secret = load_certificate(file)
+    try:
+        public, secret = load_certificate(file)
+    except ValueError as error:
+        raise TransportError(f"{file}: expected a key, found none; make new keys, or copy this one again") from error
     for key in (public, secret or public):
         if len(key) != 40:
-            raise ValueError(f"{file}: expected keys of 40 characters, got one of {len(key)}")
+            raise TransportError(f"{file}: expected keys of 40 characters, got one of {len(key)}")
     return public, secret
 
 
@@ -198,7 +204,7 @@ def create_keys(directory: str | Path) -> Keys:
     """Create a pair of keys in `directory`, and an empty folder `clients`.
 
     Raises:
-        ValueError: a pair exists already. It is not replaced, because others may rely on it.
+        TransportError: a pair exists already. It is not replaced, because others may rely on it.
         OSError: it cannot be written.
     """
     directory = Path(directory)
@@ -208,7 +214,7 @@ def create_keys(directory: str | Path) -> Keys:
         # created here with its mode, because pyzmq would create it readable by all
         os.close(os.open(secret, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except FileExistsError as error:
-        raise ValueError(f"{secret} exists already: expected a directory without keys, or use these") from error
+        raise TransportError(f"{secret} exists already: expected a directory without keys, or use these") from error
     from zmq.auth import create_certificates
 
     try:
@@ -224,20 +230,21 @@ def load_keys(directory: str | Path) -> Keys:
     """Read a directory of keys.
 
     Raises:
-        ValueError: a file is missing or contains no key, or others can read the secret key or write to the directory.
+        TransportError: a file is missing or contains no key, or others can read the secret key or write to the
+            directory.
     """
     directory = Path(directory)
     secret_file = directory / f"{_OWN}.key_secret"
     if not secret_file.is_file():
-        raise ValueError(f"{secret_file}: no such file; make keys with `steadypose keys {directory}`")
+        raise TransportError(f"{secret_file}: no such file; make keys with `steadypose keys {directory}`")
     if secret_file.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise ValueError(f"{secret_file} is open to others: run `chmod 600 {secret_file}`, or make new keys")
+        raise TransportError(f"{secret_file} is open to others: run `chmod 600 {secret_file}`, or make new keys")
     for folder in (directory, directory / "clients", directory / "servers"):
         if folder.is_dir():
             _check_folder(folder)
     public, secret = _certificate(secret_file)
     if secret is None:
-        raise ValueError(f"{secret_file}: expected a secret key, found none; make new keys")
+        raise TransportError(f"{secret_file}: expected a secret key, found none; make new keys")
     server_file = directory / "server.key"
     server = _public(server_file) if server_file.is_file() else public
     _listed(directory / "clients")  # a file that is no key is an error here, not a client that is refused later
@@ -248,14 +255,14 @@ def _check_folder(folder: Path) -> None:
     """Check that no other user can change which keys are accepted.
 
     Raises:
-        ValueError: another user owns the folder, or others may write to it.
+        TransportError: another user owns the folder, or others may write to it.
     """
     status = folder.stat()
     others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
     if status.st_uid not in (0, os.getuid()):
-        raise ValueError(f"{folder} belongs to user {status.st_uid}: expected keys of one's own; make new ones")
+        raise TransportError(f"{folder} belongs to user {status.st_uid}: expected keys of one's own; make new ones")
     if status.st_mode & others:
-        raise ValueError(
+        raise TransportError(
             f"{folder} can be written to by others, who could add keys; run `chmod go-w {folder}`, and look into it"
         )
 
@@ -273,13 +280,13 @@ def loopback_keys() -> Keys:
         return create_keys(folder)
     except OSError as error:
         raise TransportError(f"{folder}: expected to write keys there: {error.strerror}") from error
-    except ValueError:
+    except TransportError:
         pass  # they exist
     deadline = time.monotonic() + MADE_S
     while True:
         try:
             return load_keys(folder)
-        except (ValueError, OSError) as error:
+        except (TransportError, OSError) as error:
             if time.monotonic() > deadline:
                 raise TransportError(f"{folder}: {error}; remove it, and new keys are made") from error
         time.sleep(0.01)

@@ -11,7 +11,6 @@ from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.security import create_keys
 from steadypose.nodes.commands.output import File, In, Out, plural, unfinished
 from steadypose.nodes.graph.launch import bundled
-from steadypose.nodes.settings import LaunchError
 from steadypose.prior.sim.streams import ManifestError, read_manifest, record
 
 
@@ -28,10 +27,7 @@ def keys(directory: Annotated[Path, tyro.conf.arg(metavar="DIR")]) -> None:
     Args:
         directory: folder for the keys. Keep own.key_secret secret.
     """
-    try:
-        create_keys(directory)
-    except ValueError as error:
-        raise LaunchError(str(error)) from error
+    create_keys(directory)
     print(f"{directory}/own.key: to hand out")
     print(f"{directory}/own.key_secret: to keep")
     print(f"{directory}/clients/: the keys of those who may listen")

@@ -150,8 +150,7 @@ class Node(ABC):
         """Run the node until it is stopped.
 
         Raises:
-            TransportError: an address cannot be bound.
-            LaunchError: the configured keys cannot be used.
+            TransportError: an address cannot be bound, or the configured keys cannot be used.
         """
         transport = self.launch.transport
         keys = transport.curve_keys()

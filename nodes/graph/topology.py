@@ -248,12 +248,9 @@ class TransportSettings:
         """The configured CurveZMQ keys; None if none are configured.
 
         Raises:
-            LaunchError: the keys are missing, or have unsafe permissions.
+            TransportError: the keys are missing, or have unsafe permissions.
         """
-        try:
-            return load_keys(self.keys) if self.keys else None
-        except ValueError as error:
-            raise LaunchError(str(error)) from error
+        return load_keys(self.keys) if self.keys else None
 
     @property
     def ipc_directory(self) -> Path:

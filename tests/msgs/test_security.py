@@ -54,7 +54,7 @@ def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch, us
         os.chown(tmp_path, 1, -1)
     else:
         monkeypatch.setattr(os, "getuid", lambda: mine + 1)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(TransportError, match=said):
         use(tmp_path)
 
 
@@ -66,10 +66,10 @@ def test_the_secret_key_is_for_its_owner_alone(tmp_path: Path):
     assert keys.secret.decode() not in repr(keys)
     assert load_keys(tmp_path / "keys") == keys
     assert keys == Keys(keys.public, keys.secret, server=keys.public, servers={}, directory=tmp_path / "keys")
-    with pytest.raises(ValueError, match="exists already"):
+    with pytest.raises(TransportError, match="exists already"):
         create_keys(tmp_path / "keys")
     secret_file.chmod(0o640)
-    with pytest.raises(ValueError, match="chmod 600"):
+    with pytest.raises(TransportError, match="chmod 600"):
         load_keys(tmp_path / "keys")
 
 
@@ -86,14 +86,17 @@ def test_a_full_disk_leaves_no_empty_keys_that_later_calls_would_meet(tmp_path: 
 
 
 def test_keys_that_are_none_are_refused(tmp_path: Path):
-    with pytest.raises(ValueError, match="no such file; make keys with `steadypose keys"):
+    with pytest.raises(TransportError, match="no such file; make keys with `steadypose keys"):
         load_keys(tmp_path)
     create_keys(tmp_path)
     (tmp_path / "clients" / "short.key").write_text('curve\n    public-key = "short"\n')
-    with pytest.raises(ValueError, match="expected keys of 40 characters, got one of 5"):
+    with pytest.raises(TransportError, match="expected keys of 40 characters, got one of 5"):
+        load_keys(tmp_path)
+    (tmp_path / "clients" / "short.key").write_text("not found\n")
+    with pytest.raises(TransportError, match=r"short.key: expected a key, found none; make new keys"):
         load_keys(tmp_path)
     (tmp_path / "own.key_secret").write_text((tmp_path / "own.key").read_text())
-    with pytest.raises(ValueError, match="expected a secret key, found none"):
+    with pytest.raises(TransportError, match="expected a secret key, found none"):
         load_keys(tmp_path)
 
 
@@ -125,5 +128,5 @@ def test_keys_in_a_folder_that_others_may_write_to_are_refused(tmp_path: Path, p
     (keys / "servers").mkdir()
     load_keys(keys)
     (keys / part).chmod(mode)
-    with pytest.raises(ValueError, match=r"can be written to by others.*chmod go-w"):
+    with pytest.raises(TransportError, match=r"can be written to by others.*chmod go-w"):
         load_keys(keys)
