@@ -16,7 +16,7 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from importlib.metadata import version
-from io import StringIO
+from io import StringIO, TextIOWrapper
 from typing import Annotated, Any, get_type_hints
 
 from steadypose.nodes.extras import extra_of, how_to_install, install_command, upgrade_and_uninstall
@@ -55,6 +55,8 @@ INTERRUPTED = 130
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
+    if isinstance(sys.stdout, TextIOWrapper):  # a file's name may have characters that its encoding lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         status = _main(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()

@@ -1,6 +1,7 @@
 import ast
 import subprocess
 import sys
+from io import BytesIO, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
 
@@ -112,6 +113,13 @@ def test_a_bug_keeps_its_traceback(monkeypatch) -> None:
     monkeypatch.setattr("steadypose.nodes.commands.small.create_keys", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["keys", "somewhere"])
+
+
+def test_a_name_that_the_encoding_of_stdout_lacks_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with TextIOWrapper(written := BytesIO(), "ascii") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert main(["keys", str(tmp_path / "grüße")]) == 0
+        assert rb"gr\xfc\xdfe/own.key" in written.getvalue()
 
 
 def test_a_reader_that_has_seen_enough_is_no_error() -> None:
