@@ -175,6 +175,11 @@ class Subscriber(Closing):
             self.take(len(self._untaken))
         return received
 
+    @property
+    def pending(self) -> bool:
+        """Whether frames wait to be read. `receive` with a timeout of 0 returns None for one that it refuses."""
+        return bool(self.socket.poll(0))
+
     def arrived(self, topic: str) -> int:
         """Number of messages of a topic published up to the newest received one, including lost ones."""
         return sum(following for (_, of), following in self._expected.items() if of == topic)

@@ -124,6 +124,8 @@ class _Queue:
             if self._limit is None and len(self.waiting) >= READ_AHEAD:
                 break
             received = self._subscriber.receive(0, taken=False)
+            if received is None and self._subscriber.pending:
+                continue  # it was refused or too old; fresh ones may be behind it
             if received is None:
                 if not self.waiting and timeout_s > 0:
                     received = self._subscriber.receive(timeout_s, taken=False)
