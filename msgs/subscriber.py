@@ -33,6 +33,8 @@ REVIVE_S = 0.5
 
 SECOND = "second publisher"
 """Cause in `Subscriber.refused` of messages whose source is bound to another publisher."""
+HANDSHAKE = "handshake"
+"""Cause in `Subscriber.refused` of connections that do not come about, because keys do not fit or are missing."""
 
 _PUBLISHERS = 256
 _EVENT = struct.Struct("=HI")  # an event of ZeroMQ's monitor; zmq.utils.monitor could read it, but imports asyncio
@@ -108,6 +110,8 @@ class Subscriber(Closing):
         self.dropped: Counter[str] = Counter()
         self.late: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self.addresses = ", ".join(self._endpoints)
+        """where it subscribes, to be named in reports"""
         self._principals = principals or Principals()
         self._connection = self if len(self._endpoints) == 1 else None
         self._lifespan_ns = lifespan_s * 1e9
@@ -121,6 +125,7 @@ class Subscriber(Closing):
         self._untaken: deque[Taken] = deque()
         self._taken: OrderedDict[tuple[int, str], Taken] = OrderedDict()
         self._lost: dict[str, float] = {}
+        self._shut_out: set[str] = set()  # endpoints whose last handshake failed
         self._looked = 0.0
         self._context = zmq.Context()
         # XSUB, unlike SUB, can send acknowledgements
@@ -145,7 +150,7 @@ class Subscriber(Closing):
                 self._connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
-            raise TransportError(f"cannot subscribe at {', '.join(self._endpoints)}: {error.strerror}") from error
+            raise TransportError(f"cannot subscribe at {self.addresses}: {error.strerror}") from error
         except ValueError:
             self.close()
             raise
@@ -299,14 +304,17 @@ class Subscriber(Closing):
             event, _ = _EVENT.unpack(description)
             endpoint = at.decode(errors="replace")
             if event & _HANDSHAKES:
-                self._refuse("handshake")
+                self._refuse(HANDSHAKE)
+                self._shut_out.add(endpoint)
             elif event & _RETRIES:
                 self._lost.pop(endpoint, None)
+                self._shut_out.discard(endpoint)
             else:
                 self._lost[endpoint] = now
         for endpoint in [endpoint for endpoint, at in self._lost.items() if now - at > REVIVE_S]:
             del self._lost[endpoint]
-            self._refuse("too large")
+            if endpoint not in self._shut_out:
+                self._refuse("too large")
             for given in [given for given in self._endpoints if given == endpoint] or self._endpoints:
                 self.socket.disconnect(given)
                 self._connect(given)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.subscriber import SECOND
+from steadypose.msgs.subscriber import HANDSHAKE, SECOND
 from steadypose.msgs.types import Level, PoseRaw, RawBody
 
 PREFIX = "problem."
@@ -79,19 +79,29 @@ def observed(body: RawBody) -> NDArray[np.float64]:
     return np.where(missing[:, None], np.nan, positions)
 
 
-def check_wire(refused: Counter[str]) -> Iterator[Problem]:
-    """Problems with the frames that a subscriber has just refused: their numbers by cause."""
-    if second := refused[SECOND]:
+def check_wire(refused: Mapping[str, Counter[str]]) -> Iterator[Problem]:
+    """Problems with the frames that subscribers have just refused: their numbers by address, then by cause."""
+    if second := [f"{counts[SECOND]} from {at}" for at, counts in refused.items() if counts[SECOND]]:
         yield error(
             "second_publisher",
-            f"messages of a second publisher with the same source name were refused ({second}): "
+            f"messages of a second publisher with the same source name were refused ({', '.join(second)}): "
             "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
             "one of the two",
         )
-    if invalid := {cause: count for cause, count in refused.items() if cause != SECOND}:
-        counts = ", ".join(f"{cause}: {invalid[cause]}" for cause in sorted(invalid))
+    if shut_out := [at for at, counts in refused.items() if counts[HANDSHAKE]]:
+        yield error(
+            "keys",
+            f"no connection to {', '.join(shut_out)}: expected CurveZMQ keys that this side and that one know of each "
+            "other, or none on either side (docs/subscribe.md#from-another-machine)",
+        )
+    if invalid := [
+        f"{cause}: {n} from {at}"
+        for at, counts in refused.items()
+        for cause, n in sorted(counts.items())
+        if cause not in (SECOND, HANDSHAKE)
+    ]:
         yield error(
             "not_a_message",
-            f"frames are no valid messages ({counts}): expected the topic, a zero byte, a header of 17 bytes, "
-            "and CDR (docs/other_languages.md)",
+            f"frames are no valid messages ({', '.join(invalid)}): expected the topic, a zero byte, a header of 17 "
+            "bytes, and CDR (docs/other_languages.md)",
         )

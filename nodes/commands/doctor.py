@@ -109,7 +109,7 @@ def listen(launch_file: str, console: Console) -> int:
             while received := nodes.receive(0):
                 if isinstance(news := received[1], Diagnostics):
                     reported |= {cause: f"{news.node}: {text}" for cause, text in from_values(news.values).items()}
-        refused = tracker.refused
+        refused = {tracker.addresses: tracker.refused}
     # a replay's stamps are long past, and so is what a tracker's may be: neither says that they should be of now
     problems = [*check.problems(clock.now_ns(), live=False), *check_wire(refused)]
     if not frames and not problems:

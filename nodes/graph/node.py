@@ -87,7 +87,7 @@ class Node(ABC):
         self._deaf: frozenset[str] = frozenset()
         self.inbox = Inbox([], None, self.clock)
         self._subscribers: list[Subscriber] = []
-        self._refused_before: Counter[str] = Counter()
+        self._refused_before: dict[str, Counter[str]] = {}
         self._supervisor = supervisor_id()
         self._run = os.environ.get(RUN, "")
         self._relay: Relay | None = None
@@ -347,9 +347,9 @@ class Node(ABC):
 
     def _wire_problems(self) -> Iterator[Problem]:
         """Problems with refused frames since the last call."""
-        refused = sum((subscriber.refused for subscriber in self._subscribers), Counter[str]())
-        new, self._refused_before = refused - self._refused_before, refused
-        return check_wire(new)
+        refused = {subscriber.addresses: subscriber.refused.copy() for subscriber in self._subscribers}
+        before, self._refused_before = self._refused_before, refused
+        return check_wire({at: counts - before.get(at, Counter()) for at, counts in refused.items()})
 
     def _await_subscribers(self) -> None:
         """Wait until all reliable subscribers are connected, or the node is stopped."""

@@ -216,7 +216,7 @@ class MergeSource(LiveSource):
         counts = [self._unread, self._merge.counters, self._received]
         unread, refused, received = (now - before for now, before in zip(counts, self._before, strict=True))
         self._before = [count.copy() for count in counts]
-        found = list(check_wire(unread))
+        found = list(check_wire({", ".join(self._addresses): unread}))
         if unplaced := [camera for camera in received if refused[f"not calibrated, {camera}"]]:
             found.append(
                 error(

@@ -16,6 +16,7 @@ from tests.helpers.msg_strategies import EXAMPLES, diagnostics, raw
 
 from steadypose.msgs import delivery
 from steadypose.msgs import publisher as publishing
+from steadypose.msgs import subscriber as subscribing
 from steadypose.msgs.codec import encode
 from steadypose.msgs.delivery import PREFIX
 from steadypose.msgs.security import create_keys, load_keys
@@ -453,7 +454,10 @@ def key_directories(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pat
 
 
 @pytest.mark.parametrize("at", ["tcp://127.0.0.1:*", "tcp://0.0.0.0:*", "ipc://{}/socket"])
-def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, Path, Path], tmp_path: Path):
+def test_with_keys_only_the_listed_listen(
+    at: str, key_directories: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(subscribing, "REVIVE_S", 0.0)
     robot, guest, stranger = (load_keys(directory) for directory in key_directories)
     with Publisher(at.format(tmp_path), keys=robot) as publisher:
         reach = publisher.endpoint.replace("0.0.0.0", "127.0.0.1")
@@ -465,7 +469,8 @@ def test_with_keys_only_the_listed_listen(at: str, key_directories: tuple[Path, 
         ):
             assert publisher.wait_for_subscribers(["own", "guest"], timeout_s=SOON_S)
             for refused in (unlisted, keyless):
-                wait_until(lambda refused=refused: refused.receive(0) or refused.refused["handshake"])
+                wait_until(lambda refused=refused: refused.receive(0) or refused.refused["handshake"] > 1)
+                assert refused.refused.keys() == {"handshake"}, "no frame was too large"
             publisher.publish(POSE_RAW, raw())
             assert own.receive(SOON_S) == (POSE_RAW, raw())
             assert listed.receive(SOON_S) == (POSE_RAW, raw())

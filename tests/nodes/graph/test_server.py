@@ -1,8 +1,9 @@
 import dataclasses
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from conftest import VirtualClock, listeners, running, until, walk
 from tests.helpers.msg_strategies import clean
 
 from steadypose.msgs.security import create_keys
+from steadypose.msgs.subscriber import HANDSHAKE
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher, Subscriber
 from steadypose.msgs.types import Pose, PoseRaw, PoseWorld
+from steadypose.nodes.checks.problem import from_values
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
 from steadypose.nodes.graph.trajectory_node import TrajectoryNode
@@ -69,6 +72,21 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
         assert {round(m.stamp_ns / 1e6) for m in answers[name]} <= captured, "stamps are of its own clock"
         assert {body.id for m in answers[name] for body in m.bodies} == set(range(bodies))
         assert all(len(m.bodies) == bodies for m in answers[name])
+
+
+def test_what_is_garbled_or_lacks_keys_is_reported_with_the_address(make_launch, clock: VirtualClock) -> None:
+    node = TrajectoryNode(make_launch(nodes='["trajectory"]'), clock)
+    door, desk = (
+        SimpleNamespace(addresses=f"tcp://{name}:7111", dropped=Counter(), late=Counter(), refused=Counter[str]())
+        for name in ("door", "desk")
+    )
+    node._subscribers = [door, desk]  # type: ignore[list-item]
+    door.refused.update(undecodable=2)
+    desk.refused.update({HANDSHAKE: 1})
+    found = from_values(node.diagnostics().values)
+    assert "(undecodable: 2 from tcp://door:7111)" in found["not_a_message"]
+    assert "no connection to tcp://desk:7111: expected CurveZMQ keys" in found["keys"]
+    assert not from_values(node.diagnostics().values), "until it happens again"
 
 
 def test_counts_of_a_client_that_came_back_under_another_name_stay(make_launch: Callable[..., Launch]) -> None:
