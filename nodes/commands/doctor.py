@@ -28,6 +28,7 @@ from steadypose.nodes.commands.doctor_checks import (
     check_webcam,
 )
 from steadypose.nodes.extras import EXTRAS, install_command
+from steadypose.nodes.settings import LaunchError
 
 if TYPE_CHECKING:  # the doctor starts where not even numpy is installed
     from steadypose.msgs.types import PoseRaw
@@ -42,14 +43,19 @@ def doctor(live: bool = False, launch: Annotated[str, tyro.conf.arg(metavar="FIL
 
     Args:
         live: listen for three seconds to your tracker and to running nodes, and report problems.
-        launch: launch file, or name of a bundled one, whose addresses to listen at.
+        launch: with --live, a launch file, or the name of a bundled one, at whose addresses to listen.
 
     Returns:
         0 if `steadypose run` can work here, otherwise 1; with `live`, 0 if nothing is wrong.
+
+    Raises:
+        LaunchError: there is a launch file, but nothing to listen for.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if live:
         return listen(launch, console)
+    if launch != "replay":
+        raise LaunchError(f"--launch: expected --live with it; without, try `steadypose run {launch}`, which checks it")
     table = Table("", "what", box=None, pad_edge=False, header_style="bold")
     table.add_column("found", overflow="fold")
     with console.status("looking"):
@@ -60,7 +66,7 @@ def doctor(live: bool = False, launch: Annotated[str, tyro.conf.arg(metavar="FIL
     for finding in findings:
         if finding.fix:
             console.print(f"\n{finding.verdict.value} {finding.what}: {finding.found}")
-            console.print(f"  {finding.fix}", markup=False, soft_wrap=True)
+            console.print(f"  {finding.fix}", soft_wrap=True)
     bad = [finding.what for finding in findings if finding.verdict is Verdict.BAD]
     console.print()
     console.print(f"`steadypose run` cannot work yet: {', '.join(bad)}" if bad else "`steadypose run` can work here")

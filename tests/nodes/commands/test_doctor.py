@@ -41,11 +41,12 @@ def check_broken() -> Iterator[Finding]:
 
 @pytest.mark.parametrize("bad", [False, True])
 def test_exit_status_says_whether_the_main_job_can_run(bad: bool, monkeypatch, capsys) -> None:
-    note = Finding("extra view", Verdict.NOTE, "not installed", "install [this]")
+    note = Finding("extra view", Verdict.NOTE, "not [all] there", "install [this]")
     monkeypatch.setattr(command, "CHECKS", (*([check_broken] if bad else []), lambda: iter([note])))
     assert doctor() == bad
     out = capsys.readouterr().out
     assert "install [this]" in out
+    assert out.count("not [all] there") == 2  # in the table, and above the remedy
     assert ("cannot work yet: broken" in out) == ("ImportError: libusb is gone" in out) == bad
 
 
@@ -176,6 +177,11 @@ def test_webcams_that_may_not_be_used_name_the_group(monkeypatch: pytest.MonkeyP
     finding = only(checks.check_webcam)
     assert finding.verdict is Verdict.NOTE
     assert "usermod -aG video" in finding.fix
+
+
+def test_a_launch_file_that_it_would_not_read_is_refused() -> None:
+    with pytest.raises(LaunchError, match=r"--launch: expected --live with it; .* `steadypose run my\.toml`"):
+        doctor(launch="my.toml")
 
 
 def test_it_needs_nothing_that_it_looks_for() -> None:
