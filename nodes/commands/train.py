@@ -98,7 +98,7 @@ def train(
         options = TrainingOptions(data, runs, name, iterations, seed, start)
     except ValueError as error:
         raise LaunchError(f"--{error}") from error
-    if warning := little_data(data, name):
+    if warning := little_data(data, name, start):
         print(warning, file=sys.stderr)
     recipe, function = RECIPES[model]
     path = getattr(import_module(f"steadypose.training.recipes.{recipe}"), function)(options)
@@ -106,7 +106,7 @@ def train(
         print(f"weights: {install_weights(path) if install else path}")
 
 
-def little_data(path: Path, weights: str) -> str:
+def little_data(path: Path, weights: str, start: str | None = None) -> str:
     """What to say of prepared motion that is too little for a set of weights; empty if it is enough, or another file.
 
     Raises:
@@ -120,7 +120,9 @@ def little_data(path: Path, weights: str) -> str:
         taken = (arrays["split"] == "train") & ((arrays["set"] == "default") | (weights == "research"))
         minutes = float(np.diff(arrays["clip_start"])[taken].sum()) / RATE_HZ / 60.0
     had = f"{path} has {minutes:.1f} minutes of motion to train the {weights!r} weights on"
-    more = "prepare more recordings, or go on from weights that ship with --start default"
     if minutes < LEAST_MIN:
-        raise LaunchError(f"{had}: expected {ENOUGH_MIN:g} or more; {more}")
-    return f"{had}, which is little: expected {ENOUGH_MIN:g} or more; {more}" if minutes < ENOUGH_MIN else ""
+        raise LaunchError(f"{had}: expected at least {LEAST_MIN:g}, better {ENOUGH_MIN:g}; prepare more recordings")
+    more = f"expected {ENOUGH_MIN:g}; prepare more recordings" + (
+        "" if start else ", or fine-tune with --start default"
+    )
+    return f"{had}, which is little: {more}" if minutes < ENOUGH_MIN else ""

@@ -85,7 +85,9 @@ def test_little_is_said_and_next_to_nothing_refused(tmp_path: Path) -> None:
     assert "has 12.2 minutes of motion to train the 'research' weights on, which is little" in command.little_data(
         path, "research"
     )
-    with pytest.raises(LaunchError, match=r"has 0\.2 minutes of motion .* expected 30 or more; prepare more"):
+    assert "or fine-tune with --start default" in command.little_data(path, "research")
+    assert command.little_data(path, "research", "default").endswith("expected 30; prepare more recordings")
+    with pytest.raises(LaunchError, match=r"has 0\.2 minutes .* expected at least 0\.5, .*; prepare more recordings$"):
         command.little_data(path, "default")
 
 
@@ -93,5 +95,7 @@ def test_too_little_is_refused_before_anything_is_trained(shipped: Path, tmp_pat
     monkeypatch.setattr("steadypose.training.recipes.hmvae.train_hmvae", lambda options: pytest.fail("it was trained"))
     path = prepared(tmp_path / "c.npz", 0.2)
     assert main(["train", "hmvae", "--data", str(path), "--runs", str(tmp_path / "runs")]) == 2
-    assert "has 0.2 minutes of motion to train the 'default' weights on: expected 30" in capsys.readouterr().err
+    assert (
+        "has 0.2 minutes of motion to train the 'default' weights on: expected at least 0.5" in capsys.readouterr().err
+    )
     assert not (tmp_path / "runs").exists()
