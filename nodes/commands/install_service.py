@@ -132,8 +132,8 @@ class Service:
             if _is_in(path, HOMES):
                 raise LaunchError(
                     f"{path} is in a home, which a service's own user cannot read: install steadypose elsewhere "
-                    "(python3 -m venv /opt/steadypose, then /opt/steadypose/bin/pip install PATH/TO/CHECKOUT), or "
-                    "give the user whose home it is with --user"
+                    "(/usr/bin/python3 -m venv /opt/steadypose, then /opt/steadypose/bin/pip install PATH/TO/CHECKOUT),"
+                    " or give the user whose home it is with --user"
                 )
         recording = launch.settings(RecorderSettings).directory if "recorder" in launch.nodes else ""
         state = _state(self.name)

@@ -51,7 +51,7 @@ def test_words_are_systemds() -> None:
         (
             {"command": Path("/home/a/.venv/bin/steadypose")},
             {},
-            "in a home.*/opt/steadypose.*pip install PATH/TO/CHECKOUT",
+            "in a home.*/usr/bin/python3 -m venv /opt/steadypose.*pip install PATH/TO/CHECKOUT",
         ),
         ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
         ({"launch": "/tmp/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
