@@ -67,7 +67,7 @@ def prepare(
         rig: TOML file that describes files which are not recognised: metres (length of their unit), up, fps, skeleton
             (of .npy), and [canonical], which names their joint for each of smpl22 (docs/sources.md).
     """
-    console = Console()
+    console = Console(markup=False)
     sources = find_sources(mocap)
     if rig is not None:
         read = partial(read_own, description=describe(read_toml(rig)))
@@ -79,7 +79,8 @@ def prepare(
     prepared = [part for part in found if isinstance(part, Prepared)]
     dropped = [part for part in found if isinstance(part, Dropped)]
     if not prepared:
-        raise LaunchError(f"nothing usable in {mocap}; dropped: {len(dropped)}")
+        why = "".join(f"\n  {d.name}: {d.cause}" for d in dropped[:5])
+        raise LaunchError(f"nothing usable in {mocap}, recordings left out: {len(dropped)}{why}")
     out.mkdir(parents=True, exist_ok=True)
     write_prepared(prepared, out / "prepared.npz")
     report = out / "prepare-report.json"
@@ -108,7 +109,7 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
         found = [(mocap, s) for s in DATA_SETS if s.name == "own"]
     if not found:
         known = ", ".join(s.files.removesuffix(r"\b.*") for s in DATA_SETS)
-        raise LaunchError(f"expected files named {known} in '{mocap}', found none")
+        raise LaunchError(f"expected {', '.join(SUFFIXES)} or files named {known} in '{mocap}', found none")
     return found
 
 
