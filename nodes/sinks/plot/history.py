@@ -271,7 +271,9 @@ def body_of(history: History, body: int | None) -> int:
         PlotError: there are no bodies, or not the requested one.
     """
     if not history.tracks:
-        raise PlotError(f"{history.name}: expected bodies on a pose topic, found none; there is nothing to draw")
+        raise PlotError(
+            f"{history.name}: expected at least one body, found none; `steadypose info` shows what it contains"
+        )
     if body is None:
         tracks = next(history.tracks[t] for t in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if t in history.tracks)
         return max(tracks, key=lambda body: len(tracks[body].time))

@@ -159,7 +159,7 @@ def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
         (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
         (1, "nowhere/picture.png", {}, "no directory; make it first"),
         (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
-        (0, "picture.png", {}, "found none"),
+        (0, "picture.png", {}, "expected at least one body, found none; `steadypose info`"),
     ],
 )
 def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
