@@ -90,7 +90,7 @@ def listen(launch_file: str, console: Console) -> int:
     from steadypose.msgs.transport import Subscriber
     from steadypose.msgs.types import Diagnostics, PoseRaw
     from steadypose.nodes.checks.problem import check_wire, error, from_values
-    from steadypose.nodes.checks.stream import StreamCheck
+    from steadypose.nodes.checks.stream import StreamChecks
     from steadypose.nodes.graph.clock import POLL_S, Clock
     from steadypose.nodes.graph.launch import Launch
     from steadypose.nodes.graph.topology import POSE_NODES
@@ -98,7 +98,7 @@ def listen(launch_file: str, console: Console) -> int:
 
     clock, launch = Clock(), Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
-    check = StreamCheck(launch.settings(PriorSettings))
+    check = StreamChecks(launch.settings(PriorSettings), len(launch.server.clients) or 1)
     addresses, nodes_at = launch.addresses("pose_input"), [transport.endpoint(name) for name in POSE_NODES]
     reported: dict[str, str] = {}
     frames: list[PoseRaw] = []
@@ -131,12 +131,13 @@ def listen(launch_file: str, console: Console) -> int:
     for cause, text in reported.items():
         if cause not in {problem.cause for problem in problems}:
             console.print(f"{cause}: {text}", markup=False, soft_wrap=True)
-    if frames:
-        newest = frames[-1]
-        rate = len(frames) / (LISTEN_NS / 1e9)
-        bodies = max(len(raw.bodies) for raw in frames)
+    for source in {raw.source: None for raw in frames}:
+        own = [raw for raw in frames if raw.source == source]
+        newest = own[-1]
+        rate = len(own) / (LISTEN_NS / 1e9)
+        bodies = max(len(raw.bodies) for raw in own)
         console.print(
-            f"{newest.source!r}: {rate:.1f} Hz, skeleton {newest.skeleton!r}, bodies: {bodies}, frame "
+            f"{source!r}: {rate:.1f} Hz, skeleton {newest.skeleton!r}, bodies: {bodies}, frame "
             f"{newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
         )
     if problems or reported:

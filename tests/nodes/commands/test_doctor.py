@@ -258,3 +258,15 @@ def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
 def test_what_is_wrong_with_a_tracker_is_told(file: str, frames: list[PoseRaw], status: int, told: str) -> None:
     found, text = heard(file, frames)
     assert (found, told in text) == (status, True), text
+
+
+def test_each_client_of_a_server_is_examined_by_itself(file: str, folder: Path) -> None:
+    clients = f'nodes = ["prior"]\n[server]\nclients = ["ipc://{folder}/pose_input", "tcp://127.0.0.1:1"]\n'
+    Path(file).write_text(clients + Path(file).read_text())
+    frames = []
+    for raw in walk(120):
+        away = [dataclasses.replace(body, positions=body.positions + 3.0) for body in raw.bodies]
+        door = dataclasses.replace(raw, source="door", calibrated=False)
+        frames += [door, dataclasses.replace(door, source="desk", bodies=away)]
+    found, text = heard(file, frames)
+    assert (found, "'door': " in text, "'desk': " in text) == (0, True, True), text
