@@ -79,8 +79,8 @@ def prepare(
     prepared = [part for part in found if isinstance(part, Prepared)]
     dropped = [part for part in found if isinstance(part, Dropped)]
     if not prepared:
-        why = "".join(f"\n  {d.name}: {d.cause}" for d in dropped[:5])
-        raise LaunchError(f"nothing usable in {mocap}, recordings left out: {len(dropped)}{why}")
+        why = "; ".join(f"{d.name}: {d.cause.removeprefix(f'{d.name}: ')}" for d in dropped[:5])
+        raise LaunchError(f"nothing usable in {mocap}, recordings left out: {len(dropped)}. {why}")
     out.mkdir(parents=True, exist_ok=True)
     write_prepared(prepared, out / "prepared.npz")
     report = out / "prepare-report.json"
