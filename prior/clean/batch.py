@@ -3,7 +3,8 @@
 Bodies of several cameras share the stages' slots like bodies of one camera. Only the clocks differ: each stream is
 stamped by its own. All streams are therefore resampled to one shared grid, whose times are those of the first stream. A
 grid time is processed when every stream has reached it, or after `PATIENCE_NS`. A stream that is later misses that
-frame and delays no other stream.
+frame and delays no other stream. If it often is, because its camera is slower than the server waits, it starts anew on
+later grid times, by its slack.
 
 The offset from a stream's clock to the server's is the minimum of arrival time minus capture stamp: the clock
 difference plus the least network latency. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
@@ -43,6 +44,11 @@ DRIFT = 200e-6
 LATE_IN_A_ROW = 15
 """Number of late frames in a row after which a stream starts anew (half a second). Its clock was set or its latency
 grew."""
+OFTEN_LATE = 15
+"""Number of late frames, each forgotten after `FORGOTTEN` timely ones, after which a stream gets more slack."""
+FORGOTTEN = 10
+MAX_SLACK_NS = 8 * PERIOD_NS
+"""Largest slack, nanoseconds; enough for 4 Hz."""
 
 
 @dataclass
@@ -59,6 +65,19 @@ class _Stream:
     first_ns: int = -1  # first and newest grid time with joints of this stream; negative before the first
     newest_ns: int = -1
     late: int = 0  # number of its frames in a row that came too late
+    slack_ns: int = 0  # added to its times
+    often_late: float = 0.0  # number of late frames, see `OFTEN_LATE`, and by how much the latest of them were
+    lateness_ns: int = 0
+
+    @property
+    def shift_ns(self) -> int:
+        """From its clock to the times of the grid."""
+        return round(self.offset_ns) + self.slack_ns
+
+    def miss(self, lateness_ns: int) -> None:
+        """Note a late frame that the server did not skip."""
+        self.often_late += 1.0
+        self.lateness_ns = max(self.lateness_ns, lateness_ns)
 
     @property
     def last(self) -> PoseRaw:
@@ -79,6 +98,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         self._waiting: dict[int, list[BodyJoints]] = {}
         self._grid_ns: int | None = None  # a time of the shared grid
         self._done_ns: int | None = None
+        self._skipped_ns = -1  # newest grid time that was skipped
 
     @property
     def streams(self) -> int:
@@ -161,12 +181,18 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         """Put a stream's message on the grid."""
         stream = self._streams.get(raw.source)
         longest_ns = SLOWEST_NS if gap else self._timeout_ns
+        slack_ns = 0
         if stream and not -BACKWARDS_NS < raw.stamp_ns - stream.last.stamp_ns <= longest_ns:
             self.counters["stream_gap" if raw.stamp_ns > stream.last.stamp_ns else "stamp_jumped_back"] += 1
             self._forget(raw.source)
             stream = None
-        elif stream and stream.late >= LATE_IN_A_ROW:
+        elif stream and (
+            stream.late >= LATE_IN_A_ROW or (stream.often_late >= OFTEN_LATE and stream.slack_ns < MAX_SLACK_NS)
+        ):
             self.counters["stream_late"] += 1
+            slack_ns = stream.slack_ns
+            if stream.late < LATE_IN_A_ROW:
+                slack_ns = min(slack_ns + stream.lateness_ns + PERIOD_NS, MAX_SLACK_NS)
             self._forget(raw.source)
             stream = None
         if stream is None:
@@ -182,10 +208,11 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 recent=RecentMessages(),
                 sensor_pose=SensorPoseGate(),
                 heard_ns=now_ns,
+                slack_ns=slack_ns,
             )
         stream.offset_ns = min(stream.offset_ns + DRIFT * (now_ns - stream.heard_ns), now_ns - raw.stamp_ns)
         stream.heard_ns = now_ns
-        time_ns = raw.stamp_ns + round(stream.offset_ns)
+        time_ns = raw.stamp_ns + stream.shift_ns
         if time_ns <= stream.time_ns:
             # out of order, or the clock's offset was overestimated because the first messages came late
             self.counters["stamp_out_of_order"] += 1
@@ -201,8 +228,11 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 # the first frames of a new stream do not count as late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
                 stream.late += 1
+                if stream.first_ns >= 0 and tick_ns > self._skipped_ns:
+                    stream.miss(now_ns - tick_ns - PATIENCE_NS)
                 continue
             stream.late = 0
+            stream.often_late = max(stream.often_late - 1 / FORGOTTEN, 0.0)
             stream.first_ns = tick_ns if stream.first_ns < 0 else stream.first_ns
             stream.newest_ns = tick_ns
             self._waiting.setdefault(tick_ns, []).append(BodyJoints(*ready))
@@ -235,6 +265,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         for _ in range(late):
             self._done_ns += PERIOD_NS
             self._waiting.pop(self._done_ns, None)
+        self._skipped_ns = self._done_ns
         self.counters["frames_skipped"] += int(late)
         self._slots.excuse(self._done_ns)
 
@@ -260,7 +291,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 self._forget(name)
                 continue
             ids = {slot: key[1] for slot, key in enumerate(self._slots.keys) if key is not None and key[0] == name}
-            own_ns = max(stamp_ns - round(stream.offset_ns), 0)
+            own_ns = max(stamp_ns - stream.shift_ns, 0)
             raw = stream.recent.at(own_ns)
             bodies = clean_bodies(frame, SensorFrame.of(raw.sensor_pose).levelled(), ids)
             published |= bodies.keys()
@@ -270,7 +301,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
 
     def _end(self, stream: _Stream) -> PoseClean:
         """A stream's last message, not before its last frame: the grid's may lie after the last that was captured."""
-        own_ns = stream.newest_ns - round(stream.offset_ns)
+        own_ns = stream.newest_ns - stream.shift_ns
         last = dataclasses.replace(stream.last, stamp_ns=max(stream.last.stamp_ns, own_ns))
         return end_of_stream(last, self.delay_frames)
 

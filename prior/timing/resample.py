@@ -86,6 +86,8 @@ class Resampler:
         self._decimation = DecimationFilter(self._slots, delayed=self._delayed)
         self._newest_ns: int | None = None
         self._period_ns = float(PERIOD_NS)
+        self._gap_ns = 0
+        self._is_slow = False  # whether the last two frames came after longer gaps than are interpolated
         self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
         self._positions = np.full((2, self._slots, 22, 3), np.nan)
         self._confidence = np.zeros((2, self._slots, 22))
@@ -115,6 +117,8 @@ class Resampler:
 
     def _interpolated(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
         if self._newest_ns is not None:
+            before_ns, self._gap_ns = self._gap_ns, stamp_ns - self._newest_ns
+            self._is_slow = min(before_ns, self._gap_ns) > MAX_GAP_NS
             self._period_ns += PERIOD_GAIN * (min(stamp_ns - self._newest_ns, PERIOD_NS) - self._period_ns)
         self._newest_ns = stamp_ns
         look_ahead_ns = min(LOOK_AHEAD_NS, round(LOOK_AHEAD_PERIODS * self._period_ns))
@@ -137,7 +141,9 @@ class Resampler:
         before, after = self._seen_ns
         span = after - before
         between = (span <= MAX_GAP_NS) & (before - LOOK_AHEAD_NS <= tick) & (tick <= after + LOOK_AHEAD_NS)
-        alone = ~between & (np.abs(tick - after) <= LOOK_AHEAD_NS)
+        # each frame of a slow stream counts at one grid time, although it may be off by most of a period
+        reach_ns = PERIOD_NS - LOOK_AHEAD_NS if self._is_slow else LOOK_AHEAD_NS
+        alone = ~between & (after - reach_ns <= tick) & (tick <= after + LOOK_AHEAD_NS)
         share = np.where(between, (tick - before) / np.maximum(span, 1), 1.0)[..., None]
         earlier = np.where(between[..., None], self._positions[0], self._positions[1])
         positions = earlier + share * (self._positions[1] - earlier)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import raw, waving
 from tests.helpers.synthetic_poses import walker
 
-from steadypose.msgs.types import Pose, PoseClean, PoseRaw, RawBody
+from steadypose.msgs.types import OBSERVED, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.batch import PATIENCE_NS, StreamBatch
@@ -167,6 +167,25 @@ def test_who_is_late_holds_up_nobody() -> None:
     assert max(waited) <= PATIENCE_NS + PERIOD_NS + 4_000_000
     assert np.median(waited) < 10_000_000, "as long as all are prompt, nobody waits"
     assert 0 < batch.counters["late_for_batch"] == batch.counters.total() <= 6
+
+
+@pytest.mark.parametrize("period", [4, 6])
+def test_a_slow_camera_gets_its_poses_beside_a_fast_one_and_delays_nobody(period: int) -> None:
+    fast, slow = kiosk("fast", 300), kiosk("slower", 300, phase_ns=11_000_000)[::period]
+    answers, batch = serve(fast, slow)
+    assert batch.counters["stream_late"] == 1
+    found = {(answer.stamp_ns - NOW_NS) / PERIOD_NS: answer.bodies for answer in answers["slower"]}
+    assert (np.diff(list(found)) > 0.5).all()
+    settled = {frame: bodies for frame, bodies in found.items() if frame > 150}
+    assert len(settled) > 120
+    truth = waving(300, speed=1.6)
+    for frame, (body,) in settled.items():
+        if period == 4:  # slower ones are not interpolated
+            assert np.isin(body.state, OBSERVED).all()
+        seen = body.positions @ CAMERA.as_matrix().T - [2.0, 0.0, 0.0]
+        assert np.linalg.norm(seen - truth[round(frame - 0.33)], axis=-1).mean() < 0.04
+    alone = [answer.stamp_ns for answer in serve(fast)[0]["fast"]]
+    assert {answer.stamp_ns for answer in answers["fast"]} >= set(alone[2:-8])
 
 
 def test_who_falls_silent_is_forgotten_and_may_come_back() -> None:

@@ -87,6 +87,14 @@ def test_a_slow_camera_is_interpolated_between_its_frames() -> None:
     assert frames[3][1][0, 0, 0] == pytest.approx(3 * PERIOD_NS * 1e-9)
 
 
+def test_each_frame_of_a_camera_too_slow_to_be_interpolated_counts_at_one_grid_time() -> None:
+    stamps = np.arange(100) * 200_000_000 + np.random.default_rng(0).integers(0, PERIOD_NS, 100)
+    seen = [frame for frame in feed(stamps.tolist()) if np.isfinite(frame.positions).all()]
+    assert len(seen) >= len(stamps) - 2  # the first three show that it is slow
+    nearest = np.abs(stamps[:, None] - [frame.stamp_ns for frame in seen]).min(axis=0)
+    assert nearest.max() <= PERIOD_NS - LOOK_AHEAD_NS
+
+
 def test_the_lesser_confidence_holds_between_two_observations() -> None:
     resampler = Resampler(SLOTS)
     resampler.update(0, line(0), np.full((SLOTS, 22), 0.9))
