@@ -13,6 +13,7 @@ from steadypose.msgs.types import Level, PoseClean, PoseRaw
 from steadypose.nodes.checks.geometry import check_geometry, check_jumps, check_speed
 from steadypose.nodes.checks.layout import check_layout
 from steadypose.nodes.checks.problem import Problem, error, some_bodies, warning
+from steadypose.nodes.checks.stamps import ENOUGH as ENOUGH_STAMPS
 from steadypose.nodes.checks.stamps import check_stamps
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -72,8 +73,8 @@ class Answers:
         self._in = self._out = self._joints = self._flagged = 0
 
 
-LENGTH_NS = 1_500_000_000
-"""Length of the window of messages that are examined, nanoseconds."""
+LENGTHS_NS = (1_500_000_000, 2_500_000_000)
+"""Length of the window of messages that are examined, nanoseconds, and of a slow stream's."""
 LONGEST = 90
 """Largest number of messages in the window."""
 SILENT_NS = 2_000_000_000
@@ -135,7 +136,10 @@ class StreamCheck:
         return self._found
 
     def _problems(self, now_ns: int, live: bool) -> Iterator[Problem]:
-        arrivals = [(at_ns, raw) for at_ns, raw in self._arrivals if now_ns - at_ns <= LENGTH_NS]
+        arrivals: list[tuple[int, PoseRaw]] = []
+        for length_ns in LENGTHS_NS:
+            if len(arrivals) < ENOUGH_STAMPS:
+                arrivals = [(at_ns, raw) for at_ns, raw in self._arrivals if now_ns - at_ns <= length_ns]
         messages = [raw for _, raw in arrivals]
         if not messages:
             return

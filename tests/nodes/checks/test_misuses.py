@@ -281,6 +281,14 @@ def test_a_short_hold_up_is_no_clock_that_was_set() -> None:
     assert not check.problems(START_NS + 3 * SECOND_NS, live=True)
 
 
+@pytest.mark.parametrize("every", [4, 6])
+def test_a_live_stream_that_is_slow_is_named(every: int) -> None:
+    check = StreamCheck(PriorSettings())
+    for raw in walk()[::every]:
+        check.see(raw, raw.stamp_ns)
+    assert [problem.cause for problem in check.problems(START_NS + 3 * SECOND_NS, live=True)] == ["slow"]
+
+
 class TestNode:
     @pytest.fixture
     def node(self, make_launch: Callable[..., Launch], clock: VirtualClock) -> PriorNode:
