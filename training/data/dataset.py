@@ -72,7 +72,10 @@ class MotionSet:
         if flat:
             wanted &= data["flat"]
         if not wanted.any():
-            raise MotionError(f"{path} has no clip of split '{split}' for the '{weights}' weights")
+            raise MotionError(
+                f"{path} has no clip of split '{split}' for the '{weights}' weights: of your own recordings, put some "
+                f"person's into a folder '{split}', and prepare again"
+            )
         frames = np.concatenate([np.arange(starts[c], starts[c + 1]) for c in np.flatnonzero(wanted)])
         lengths = np.diff(starts)[wanted]
         return cls(

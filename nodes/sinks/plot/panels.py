@@ -355,9 +355,9 @@ def draw_summary(ax: Axes, history: History, body: int, errors: dict[str, TrackE
             steps = np.diff(stamps)
             usual = np.median(steps)
             gaps = int((steps > GAP_RATIO * usual).sum())
-            rate = (len(stamps) - 1) / (stamps[-1] - stamps[0]) if stamps[-1] > stamps[0] else np.nan
+            rate = 1 / usual if usual > 0 else np.nan
             longest = f"longest {steps.max() * 1e3:.0f} ms"
-            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz {gaps:>3} gaps, {longest}")
+            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz, gaps: {gaps}, {longest}")
     clean = history.track(POSE_CLEAN, body)
     if clean is not None:
         shares = [f"{state.name.lower()} {(clean.state == state).mean():.1%}" for state in JointState]

@@ -222,6 +222,14 @@ def test_nothing_to_prepare_says_what_was_looked_for(tmp_path: Path) -> None:
     assert not (tmp_path / "data").exists()
 
 
+def test_motion_without_people_held_out_says_where_to_put_them(tmp_path: Path) -> None:
+    (part,) = prepare_clip(a_clip(standing(40)), "default", "train")
+    assert isinstance(part, Prepared)
+    write_prepared([part], tmp_path / "prepared.npz")
+    with pytest.raises(MotionError, match=r"no clip of split 'val'.*into a folder 'val', and prepare again"):
+        MotionSet.load(tmp_path / "prepared.npz", "default", "val")
+
+
 def test_what_only_measures_trains_no_weights_whatever_the_file_says(tmp_path: Path) -> None:
     parts = [p for n in (40, 50, 60, 70) for p in prepare_clip(a_clip(standing(n)), "default", "train")]
     trains, validates, tests, researches = (p for p in parts if isinstance(p, Prepared))
