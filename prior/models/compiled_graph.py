@@ -15,7 +15,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.matmul import multiply
+from steadypose.prior.models.matmul import LANES, multiply
 from steadypose.prior.models.weights import Arrays, part
 
 LOG_VAR_RANGE = (-10.0, 3.0)
@@ -204,27 +204,31 @@ def _attend(read, heads, out):
     nodes, width = out.shape
     size = width // heads
     scale = _ONE / np.sqrt(np.float32(size))
-    scores = np.empty(nodes, dtype=np.float32)
-    for head in range(heads):
-        query, key, value = head * size, width + head * size, 2 * width + head * size
+    wide = max(nodes, LANES)  # columns that fill a vector; those beyond the nodes stay 0
+    query, keys = np.empty((nodes, size), dtype=np.float32), np.zeros((size, wide), dtype=np.float32)
+    shares, value = np.empty((nodes, wide), dtype=np.float32), np.zeros((wide, size), dtype=np.float32)
+    joined = np.empty((nodes, size), dtype=np.float32)
+    no_share, no_value = np.zeros((1, wide), dtype=np.float32), np.zeros((1, size), dtype=np.float32)
+    for first in range(0, width, size):
         for row in range(nodes):
-            most = np.float32(-np.inf)
-            for other in range(nodes):
-                score = np.float32(0)
-                for k in range(size):
-                    score += read[row, query + k] * read[other, key + k]
-                scores[other] = scale * score
-                most = max(most, scores[other])
-            total = np.float32(0)
-            for other in range(nodes):
-                scores[other] = np.exp(scores[other] - most)
-                total += scores[other]
             for k in range(size):
-                out[row, query + k] = 0
+                query[row, k] = scale * read[row, first + k]
+                keys[k, row] = read[row, width + first + k]
+                value[row, k] = read[row, 2 * width + first + k]
+        multiply(query, keys, no_share, shares)
+        for row in range(nodes):
+            most, total = np.float32(-np.inf), np.float32(0)
             for other in range(nodes):
-                share = scores[other] / total
-                for k in range(size):
-                    out[row, query + k] += share * read[other, value + k]
+                most = max(most, shares[row, other])
+            for other in range(nodes):
+                shares[row, other] = np.exp(shares[row, other] - most)
+                total += shares[row, other]
+            for other in range(nodes):
+                shares[row, other] /= total
+        multiply(shares, value, no_value, joined)
+        for row in range(nodes):
+            for k in range(size):
+                out[row, first + k] = joined[row, k]
 
 
 @njit(cache=True)

@@ -18,11 +18,12 @@ from numba.extending import intrinsic
 
 from steadypose.prior.compiled import njit
 
-_LANES = 16
+LANES = 16
 """Number of floats in a vector. Where a register holds fewer, LLVM uses several registers."""
 
 _ROWS = 6
-"""Number of rows in a tile."""
+_FEWER_ROWS = 5
+"""Numbers of rows in a tile. Of the two, the one is taken whose tiles overlap less: 10 rows are two tiles of 5."""
 
 _WIDE = 3 if get_host_cpu_features().get("avx512f") else 1
 """Number of vectors in a row of a wide tile. Its 18 sums, 3 vectors of weights and one of an element of ``a`` fit into
@@ -31,8 +32,8 @@ _WIDE = 3 if get_host_cpu_features().get("avx512f") else 1
 
 def _tile(rows: int, vectors: int) -> Any:
     """Return a function for loops that writes a tile of a product, of ``rows`` rows and ``vectors`` vectors each."""
-    vector, lane, size = ir.VectorType(ir.FloatType(), _LANES), ir.IntType(32), ir.IntType(64)
-    nothing, zeroth = ir.Constant(vector, [0.0] * _LANES), ir.Constant(ir.VectorType(lane, _LANES), [0] * _LANES)
+    vector, lane, size = ir.VectorType(ir.FloatType(), LANES), ir.IntType(32), ir.IntType(64)
+    nothing, zeroth = ir.Constant(vector, [0.0] * LANES), ir.Constant(ir.VectorType(lane, LANES), [0] * LANES)
     tile = [(r, v) for r in range(rows) for v in range(vectors)]
 
     @intrinsic
@@ -52,7 +53,7 @@ def _tile(rows: int, vectors: int) -> Any:
                 return builder.gep(arrays[of].data, [builder.add(builder.mul(r, width), c)])
 
             def place(of: int, r: Any, v: int) -> Any:
-                at = element(of, r, builder.add(arguments[5], size(v * _LANES)), columns)
+                at = element(of, r, builder.add(arguments[5], size(v * LANES)), columns)
                 return builder.bitcast(at, vector.as_pointer())
 
             one_shift = builder.icmp_signed("==", cgutils.unpack_tuple(builder, arrays[2].shape)[0], size(1))
@@ -81,6 +82,7 @@ def _tile(rows: int, vectors: int) -> Any:
 
 
 _tile_wide, _tile_narrow = _tile(_ROWS, _WIDE), _tile(_ROWS, 1)
+_fewer_wide, _fewer_narrow = _tile(_FEWER_ROWS, _WIDE), _tile(_FEWER_ROWS, 1)
 _row_wide, _row_narrow = _tile(1, _WIDE), _tile(1, 1)
 
 
@@ -94,10 +96,10 @@ def multiply(a, weight, shift, product):
         raise ValueError("multiply: expected a product of as many rows as its first matrix and columns as its second")
     if shift.shape[1] != columns or len(shift) not in (1, rows):
         raise ValueError("multiply: expected a shift of one row or of the product's, and of its columns")
-    if columns >= _LANES:
+    if columns >= LANES:
         _multiply_wide(a, weight, shift, product)
         return
-    whole = np.empty((rows, _LANES), dtype=np.float32)
+    whole = np.empty((rows, LANES), dtype=np.float32)
     _multiply_wide(a, _widened(weight), _widened(shift), whole)
     for row in range(rows):
         for column in range(columns):
@@ -106,7 +108,7 @@ def multiply(a, weight, shift, product):
 
 @njit(cache=True)
 def _widened(values):
-    wide = np.zeros((len(values), _LANES), dtype=np.float32)
+    wide = np.zeros((len(values), LANES), dtype=np.float32)
     for row in range(len(values)):
         for column in range(values.shape[1]):
             wide[row, column] = values[row, column]
@@ -117,16 +119,24 @@ def _widened(values):
 def _multiply_wide(a, weight, shift, product):
     """Multiply tile by tile. The last tiles may overlap the ones before, and then write the same values again."""
     rows, columns = product.shape
+    is_fewer = -(-rows // _FEWER_ROWS) * _FEWER_ROWS < -(-rows // _ROWS) * _ROWS
     column = 0
     while column < columns:
-        wide = column + _WIDE * _LANES <= columns
-        at = column if wide else min(column, columns - _LANES)
-        if rows < _ROWS:
+        wide = column + _WIDE * LANES <= columns
+        at = column if wide else min(column, columns - LANES)
+        if rows < _FEWER_ROWS:
             for row in range(rows):
                 if wide:
                     _row_wide(a, weight, shift, product, row, at)
                 else:
                     _row_narrow(a, weight, shift, product, row, at)
+        elif is_fewer:
+            for first in range(0, rows, _FEWER_ROWS):
+                row = min(first, rows - _FEWER_ROWS)
+                if wide:
+                    _fewer_wide(a, weight, shift, product, row, at)
+                else:
+                    _fewer_narrow(a, weight, shift, product, row, at)
         else:
             for first in range(0, rows, _ROWS):
                 row = min(first, rows - _ROWS)
@@ -134,4 +144,4 @@ def _multiply_wide(a, weight, shift, product):
                     _tile_wide(a, weight, shift, product, row, at)
                 else:
                     _tile_narrow(a, weight, shift, product, row, at)
-        column += _WIDE * _LANES if wide else _LANES
+        column += _WIDE * LANES if wide else LANES

@@ -29,7 +29,7 @@ def test_it_is_the_product_of_numpy(rows: int, inner: int, columns: int, one_shi
     np.testing.assert_allclose(product(a, weight, shift), shift + a.astype(float) @ weight, atol=2e-4)
 
 
-@pytest.mark.parametrize("rows", [2, 5, 6, 7, 13])
+@pytest.mark.parametrize("rows", [2, 5, 6, 7, 10, 13])
 def test_a_row_does_not_depend_on_the_others(rows: int) -> None:
     a, weight, shift = matrices(rows, 300, 80, 0)
     together = product(a, weight, shift)
