@@ -3,8 +3,8 @@
 Bodies of several cameras share the stages' slots like bodies of one camera. Only the clocks differ: each stream is
 stamped by its own. All streams are therefore resampled to one shared grid, whose times are those of the first stream. A
 grid time is processed when every stream has reached it, or after `PATIENCE_NS`. A stream that is later misses that
-frame and delays no other stream. If it often is, because its camera is slower than the server waits, it starts anew on
-later grid times, by its slack.
+frame and delays no other stream. If it often is, because the time between its messages is longer than the server waits,
+it starts anew on later grid times, by its slack.
 
 The offset from a stream's clock to the server's is the minimum of arrival time minus capture stamp: the clock
 difference plus the least network latency. The minimum decays slowly (`DRIFT`), so that it follows clocks that drift.
@@ -66,18 +66,23 @@ class _Stream:
     newest_ns: int = -1
     late: int = 0  # number of its frames in a row that came too late
     slack_ns: int = 0  # added to its times
-    often_late: float = 0.0  # number of late frames, see `OFTEN_LATE`, and by how much the latest of them were
-    lateness_ns: int = 0
+    often_late: float = 0.0  # number of late frames after long intervals, see `OFTEN_LATE`, and the longest of these
+    interval_ns: int = 0
 
     @property
     def shift_ns(self) -> int:
         """From its clock to the times of the grid."""
         return round(self.offset_ns) + self.slack_ns
 
-    def miss(self, lateness_ns: int) -> None:
-        """Note a late frame that the server did not skip."""
-        self.often_late += 1.0
-        self.lateness_ns = max(self.lateness_ns, lateness_ns)
+    @property
+    def wanted_slack_ns(self) -> int:
+        """The slack with which its late frames would have been in time."""
+        return min(self.interval_ns - PATIENCE_NS + PERIOD_NS, MAX_SLACK_NS)
+
+    @property
+    def needs_slack(self) -> bool:
+        """Whether frames are often late that more slack would bring in time."""
+        return self.often_late >= OFTEN_LATE and self.wanted_slack_ns > self.slack_ns
 
     @property
     def last(self) -> PoseRaw:
@@ -98,7 +103,6 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         self._waiting: dict[int, list[BodyJoints]] = {}
         self._grid_ns: int | None = None  # a time of the shared grid
         self._done_ns: int | None = None
-        self._skipped_ns = -1  # newest grid time that was skipped
 
     @property
     def streams(self) -> int:
@@ -146,7 +150,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         else:
             layout = layout_of(raw, self.counters)
             if layout is not None and self._is_pose_accepted(raw):
-                self._take(raw, layout, now_ns, gap=gap)
+                self._take(raw, layout, now_ns, gap=gap, hurry=hurry)
         cleaned += self._advance(now_ns, hurry)
         if self._streams and all(stream.last.end_of_stream for stream in self._streams.values()):
             cleaned += self.flush()  # all streams have ended, so no further frame will arrive
@@ -177,7 +181,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self._forget(raw.source)
         return verdict is not Verdict.SUSPECT
 
-    def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int, *, gap: bool) -> None:
+    def _take(self, raw: PoseRaw, layout: Skeleton, now_ns: int, *, gap: bool, hurry: bool) -> None:
         """Put a stream's message on the grid."""
         stream = self._streams.get(raw.source)
         longest_ns = SLOWEST_NS if gap else self._timeout_ns
@@ -186,13 +190,9 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self.counters["stream_gap" if raw.stamp_ns > stream.last.stamp_ns else "stamp_jumped_back"] += 1
             self._forget(raw.source)
             stream = None
-        elif stream and (
-            stream.late >= LATE_IN_A_ROW or (stream.often_late >= OFTEN_LATE and stream.slack_ns < MAX_SLACK_NS)
-        ):
+        elif stream and (stream.late >= LATE_IN_A_ROW or stream.needs_slack):
             self.counters["stream_late"] += 1
-            slack_ns = stream.slack_ns
-            if stream.late < LATE_IN_A_ROW:
-                slack_ns = min(slack_ns + stream.lateness_ns + PERIOD_NS, MAX_SLACK_NS)
+            slack_ns = stream.wanted_slack_ns if stream.needs_slack else stream.slack_ns
             self._forget(raw.source)
             stream = None
         if stream is None:
@@ -218,6 +218,8 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             self.counters["stamp_out_of_order"] += 1
             stream.late += 1
             return
+        # neither a server that falls behind nor messages that it dropped make a client slow
+        interval_ns = 0 if gap or hurry or stream.time_ns < 0 else time_ns - stream.time_ns
         stream.recent.append(raw)
         stream.time_ns = time_ns
         # levelled, with the sensor at the origin, because the streams share no world frame
@@ -228,8 +230,9 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
                 # the first frames of a new stream do not count as late
                 self.counters["late_for_batch"] += stream.first_ns >= 0
                 stream.late += 1
-                if stream.first_ns >= 0 and tick_ns > self._skipped_ns:
-                    stream.miss(now_ns - tick_ns - PATIENCE_NS)
+                if interval_ns > PATIENCE_NS:
+                    stream.often_late += 1.0
+                    stream.interval_ns = max(stream.interval_ns, interval_ns)
                 continue
             stream.late = 0
             stream.often_late = max(stream.often_late - 1 / FORGOTTEN, 0.0)
@@ -265,7 +268,6 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
         for _ in range(late):
             self._done_ns += PERIOD_NS
             self._waiting.pop(self._done_ns, None)
-        self._skipped_ns = self._done_ns
         self.counters["frames_skipped"] += int(late)
         self._slots.excuse(self._done_ns)
 

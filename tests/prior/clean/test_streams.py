@@ -188,6 +188,19 @@ def test_a_slow_camera_gets_its_poses_beside_a_fast_one_and_delays_nobody(period
     assert {answer.stamp_ns for answer in answers["fast"]} >= set(alone[2:-8])
 
 
+def test_who_is_held_up_by_the_way_or_by_the_server_is_not_slow() -> None:
+    fast, bunched = kiosk("fast", 200), kiosk("slower", 200)
+    bunched = [(bunched[min(k + 3 - k % 4, 199)][0] + k, raw) for k, (_, raw) in enumerate(bunched)]
+    _, batch = serve(fast, bunched)
+    assert batch.counters["late_for_batch"] > 40
+    assert not batch.counters["stream_late"]
+    batch = StreamBatch(PriorSettings(), max_streams=4)
+    for now_ns, message in heapq.merge(fast, kiosk("slower", 200)[::6], key=lambda arrival: arrival[0]):
+        batch.process_at(message, now_ns, gap=True)
+    assert batch.counters["late_for_batch"]
+    assert not batch.counters["stream_late"]
+
+
 def test_who_falls_silent_is_forgotten_and_may_come_back() -> None:
     steady = kiosk("steady", 90)
     leaves = kiosk("gone", 90)
