@@ -120,28 +120,23 @@ def _multiply_wide(a, weight, shift, product):
     """Multiply tile by tile. The last tiles may overlap the ones before, and then write the same values again."""
     rows, columns = product.shape
     is_fewer = -(-rows // _FEWER_ROWS) * _FEWER_ROWS < -(-rows // _ROWS) * _ROWS
+    height = 1 if rows < _FEWER_ROWS else _FEWER_ROWS if is_fewer else _ROWS
     column = 0
     while column < columns:
         wide = column + _WIDE * LANES <= columns
         at = column if wide else min(column, columns - LANES)
-        if rows < _FEWER_ROWS:
-            for row in range(rows):
-                if wide:
-                    _row_wide(a, weight, shift, product, row, at)
-                else:
-                    _row_narrow(a, weight, shift, product, row, at)
-        elif is_fewer:
-            for first in range(0, rows, _FEWER_ROWS):
-                row = min(first, rows - _FEWER_ROWS)
-                if wide:
-                    _fewer_wide(a, weight, shift, product, row, at)
-                else:
-                    _fewer_narrow(a, weight, shift, product, row, at)
-        else:
-            for first in range(0, rows, _ROWS):
-                row = min(first, rows - _ROWS)
-                if wide:
-                    _tile_wide(a, weight, shift, product, row, at)
-                else:
-                    _tile_narrow(a, weight, shift, product, row, at)
+        for first in range(0, rows, height):
+            row = min(first, rows - height)
+            if wide and height == _ROWS:
+                _tile_wide(a, weight, shift, product, row, at)
+            elif wide and height == _FEWER_ROWS:
+                _fewer_wide(a, weight, shift, product, row, at)
+            elif wide:
+                _row_wide(a, weight, shift, product, row, at)
+            elif height == _ROWS:
+                _tile_narrow(a, weight, shift, product, row, at)
+            elif height == _FEWER_ROWS:
+                _fewer_narrow(a, weight, shift, product, row, at)
+            else:
+                _row_narrow(a, weight, shift, product, row, at)
         column += _WIDE * LANES if wide else LANES
