@@ -30,7 +30,7 @@ from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 155
+LOOPS = 160
 """Number of entries that the nodes need with the default settings."""
 COMPLETE = "complete"
 """Name of a file beside the entries: the digest of the sources for which all entries exist."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.matmul import LANES, multiply
+from steadypose.prior.models.matmul import LANES, multiply, multiply_packed, packed
 from steadypose.prior.models.weights import Arrays, part
 
 LOG_VAR_RANGE = (-10.0, 3.0)
@@ -75,7 +75,7 @@ class Program:
         out = self.matrix(nodes, weight.shape[1]) if onto == _NONE else onto
         stored = _NONE if adjacency is None else self._store(adjacency)
         shift = self._store(np.broadcast_to(bias, (nodes, weight.shape[1])))
-        return self._step(_LINEAR, out, of, self._store(weight), shift, stored, plus, int(active))
+        return self._step(_LINEAR, out, of, self._store(packed(weight)), shift, stored, plus, int(active))
 
     def layer(self, of: int, layer: Arrays, *, plus: int = _NONE, onto: int = _NONE, active: bool = False) -> int:
         """Add a `GraphLinear` with these weights. Without weights, return ``of``: equal nodes need no layer between."""
@@ -262,20 +262,21 @@ def _do(step, shapes, starts, weights, values, scratch, nothing):
             activated = scratch[0, : a.size].reshape(a.shape)
             _gelu(a.ravel(), activated.ravel())
             a = activated
-        weight = weights[of_weight : of_weight + features_in * features].reshape(features_in, features)
+        groups = (features + LANES - 1) // LANES
+        weight = weights[of_weight : of_weight + groups * features_in * LANES].reshape(groups, features_in, LANES)
         shift = weights[of_bias : of_bias + out.size].reshape(out.shape)
         product = scratch[2, : out.size].reshape(out.shape)
         if of_adjacency == _NONE:
-            multiply(a, weight, shift, product)
+            multiply_packed(a, weight, shift, product)
         else:
             adjacency = weights[of_adjacency : of_adjacency + nodes * nodes_in].reshape(nodes, nodes_in)
             if _mix_first(nodes_in, features_in, nodes, features):
                 mixed = scratch[1, : nodes * features_in].reshape(nodes, features_in)
                 multiply(adjacency, a, nothing[:features_in].reshape(1, -1), mixed)
-                multiply(mixed, weight, shift, product)
+                multiply_packed(mixed, weight, shift, product)
             else:
                 weighed = scratch[1, : nodes_in * features].reshape(nodes_in, features)
-                multiply(a, weight, nothing[:features].reshape(1, -1), weighed)
+                multiply_packed(a, weight, nothing[:features].reshape(1, -1), weighed)
                 multiply(adjacency, weighed, shift, product)
         if plus != _NONE:
             _add(_view(values, shapes, starts, plus).ravel(), _ONE, product.ravel())

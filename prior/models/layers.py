@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats32
-from steadypose.prior.models.matmul import multiply
+from steadypose.prior.models.matmul import multiply_packed, packed
 from steadypose.prior.models.weights import Arrays
 
 SLOPE = 0.2
@@ -27,12 +27,12 @@ class Dense:
     """A linear layer of ``weight`` (out, in) and ``bias`` (out) or (1), from (N, in) to (N, out)."""
 
     def __init__(self, weight: Floats32, bias: Floats32) -> None:
-        self._weight = np.ascontiguousarray(weight.T, dtype=np.float32)
+        self._weight = packed(weight.T)
         self._bias = np.full((1, len(weight)), bias, dtype=np.float32)
 
     def __call__(self, x: Floats32) -> Floats32:
-        out = np.empty((len(x), self._weight.shape[1]), dtype=np.float32)
-        multiply(np.ascontiguousarray(x, dtype=np.float32), self._weight, self._bias, out)
+        out = np.empty((len(x), self._bias.shape[1]), dtype=np.float32)
+        multiply_packed(np.ascontiguousarray(x, dtype=np.float32), self._weight, self._bias, out)
         return out
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.prior.compiled import njit
-from steadypose.prior.models.matmul import multiply
+from steadypose.prior.models.matmul import multiply_packed, packed
 from steadypose.prior.models.mixture.bank import (
     DENSITIES,
     EXPERTS,
@@ -133,7 +133,7 @@ class MixtureSmoother:
 
 
 class _Network(NamedTuple):
-    """A trained `MixtureNet`: float32 weights (in, out) and biases (rows, out). Biases of the same sum are merged."""
+    """A trained `MixtureNet`: float32 weights, `packed`, and biases (rows, out). Biases of the same sum are merged."""
 
     mean: Floats
     per_deviation: Floats
@@ -172,7 +172,7 @@ def _network(name: str) -> _Network:
     arrays, _ = load_weights(name, "mixture")
 
     def weight(layer: str) -> Floats:
-        return np.ascontiguousarray(arrays[f"{layer}.weight"].T)
+        return packed(arrays[f"{layer}.weight"].T)
 
     def bias(layer: str, rows: int = 1) -> Floats:
         return np.tile(arrays[f"{layer}.bias"], (rows, 1))
@@ -207,12 +207,12 @@ def _write_outputs(slots, features, net, memory):
         for j in range(joints):
             for k in range(FEATURES):
                 normalised[b, j, k] = (features[slot, j, k] - net.mean[k]) * net.per_deviation[k]
-        multiply(normalised[b], net.read, net.joint, own[b])
+        multiply_packed(normalised[b], net.read, net.joint, own[b])
         _rectify(own[b])
         _remember(own[b], net.own_decay, memory.own[slot], memory.own_weight[slot], own_before[b])
     body = np.empty((count, len(net.body_decay)), dtype=np.float32)
     lasting, summand = np.empty_like(body), np.empty_like(body)
-    multiply(own.reshape(count, -1), net.gather, net.gather_bias, body)
+    multiply_packed(own.reshape(count, -1), net.gather, net.gather_bias, body)
     _rectify(body)
     started = np.empty(count, dtype=np.bool_)
     for b in range(count):
@@ -221,22 +221,22 @@ def _write_outputs(slots, features, net, memory):
         started[b] = memory.body_weight[slot, 0] > zero
         _remember(body[row], net.body_decay, memory.body[at], memory.body_weight[at], lasting[row])
     for of, weight, bias in ((lasting, net.remember, net.remember_bias), (body, net.think, net.think_bias)):
-        multiply(of, weight, bias, summand)
+        multiply_packed(of, weight, bias, summand)
         _rectify(summand)
         _add(summand, body)
     context = np.empty((count, net.tell_bias.size), dtype=np.float32)
-    multiply(body, net.tell, net.tell_bias.reshape(1, -1), context)
-    mixed, new = np.empty((joints, net.mix.shape[1]), dtype=np.float32), np.empty_like(net.write_bias)
+    multiply_packed(body, net.tell, net.tell_bias.reshape(1, -1), context)
+    mixed, new = np.empty((joints, net.deepen_bias.shape[1]), dtype=np.float32), np.empty_like(net.write_bias)
     deeper = np.empty_like(mixed)
     for b in range(count):
-        multiply(
+        multiply_packed(
             _concatenated(normalised[b], own_before[b], context[b].reshape(joints, -1)), net.mix, net.joint_mix, mixed
         )
         _rectify(mixed)
-        multiply(mixed, net.deepen, net.deepen_bias, deeper)
+        multiply_packed(mixed, net.deepen, net.deepen_bias, deeper)
         _rectify(deeper)
         _add(deeper, mixed)
-        multiply(mixed, net.write, net.write_bias, new)
+        multiply_packed(mixed, net.write, net.write_bias, new)
         written = memory.written[slots[b]]
         for j in range(joints):
             for k in range(OUTPUTS):

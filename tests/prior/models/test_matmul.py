@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numba import TypingError
 
-from steadypose.prior.models.matmul import multiply
+from steadypose.prior.models.matmul import multiply, multiply_packed, packed
 
 
 def matrices(rows: int, inner: int, columns: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -26,10 +26,13 @@ def product(a: np.ndarray, weight: np.ndarray, shift: np.ndarray) -> np.ndarray:
 def test_it_is_the_product_of_numpy(rows: int, inner: int, columns: int, one_shift: bool, seed: int) -> None:
     a, weight, shift = matrices(rows, inner, columns, seed)
     shift = shift[:1] if one_shift else shift
-    np.testing.assert_allclose(product(a, weight, shift), shift + a.astype(float) @ weight, atol=2e-4)
+    found, of_packed = product(a, weight, shift), np.full((rows, columns), np.nan, dtype=np.float32)
+    np.testing.assert_allclose(found, shift + a.astype(float) @ weight, atol=2e-4)
+    multiply_packed(a, packed(weight), shift, of_packed)
+    np.testing.assert_array_equal(of_packed, found)
 
 
-@pytest.mark.parametrize("rows", [2, 5, 6, 7, 10, 13])
+@pytest.mark.parametrize("rows", [2, 5, 6, 7, 10, 13, 20])
 def test_a_row_does_not_depend_on_the_others(rows: int) -> None:
     a, weight, shift = matrices(rows, 300, 80, 0)
     together = product(a, weight, shift)
@@ -55,3 +58,6 @@ def test_matrices_that_do_not_fit_are_refused(matrix: int, axis: int) -> None:
     arrays[matrix] = np.ascontiguousarray(arrays[matrix].take(range(19), axis))
     with pytest.raises(ValueError, match="multiply: expected"):
         multiply(*arrays)
+    a, weight, shift, written = arrays
+    with pytest.raises(ValueError, match="multiply: expected"):
+        multiply_packed(a, packed(weight), shift, written[:, :10])
