@@ -70,7 +70,7 @@ def _tile(rows: int, vectors: int) -> Any:
         """Write the tile of ``shift + a @ weight`` that begins at ``row`` and ``column``.
 
         Its first vector of ``weight`` (N,) is at ``start``, that of the next row ``below`` floats further, and the next
-        vector of a row ``beside`` floats further.
+        vector of a row ``near`` floats further.
         """
         matrices = all((each.dtype, each.ndim, each.layout) == (types.float32, 2, "C") for each in (a, shift, product))
         if not matrices or (weight.dtype, weight.ndim, weight.layout) != (types.float32, 1, "C"):
@@ -81,7 +81,7 @@ def _tile(rows: int, vectors: int) -> Any:
                 context.make_array(kind)(context, builder, value)
                 for kind, value in zip((a, weight, shift, product), arguments[:4], strict=True)
             ]
-            at_row, at_column, start, below, beside = arguments[4:]
+            at_row, at_column, start, below, near = arguments[4:]
             inner, columns = (cgutils.unpack_tuple(builder, arrays[of].shape)[1] for of in (0, 3))
 
             def element(of: int, r: Any, c: Any, width: Any) -> Any:
@@ -102,7 +102,7 @@ def _tile(rows: int, vectors: int) -> Any:
                 first = builder.add(start, builder.mul(loop.index, below))
                 weights = []
                 for v in range(vectors):
-                    at = builder.gep(arrays[1].data, [builder.add(first, builder.mul(beside, size(v)))])
+                    at = builder.gep(arrays[1].data, [builder.add(first, builder.mul(near, size(v)))])
                     weights.append(builder.load(builder.bitcast(at, vector.as_pointer()), align=4))
                 for r in range(rows):
                     one = builder.load(element(0, in_rows[r], loop.index, inner))
@@ -134,9 +134,9 @@ def multiply(a, weight, shift, product):
     inner, columns = weight.shape
     _check(a, inner, columns == product.shape[1], shift, product)
     if columns >= LANES:
-        _multiply(a, weight.ravel(), shift, product, columns, LANES)
+        _multiply(a, weight.reshape(-1), shift, product, columns, LANES)
     else:
-        _multiply_narrow(a, _widened(weight).ravel(), shift, product)
+        _multiply_narrow(a, _widened(weight).reshape(-1), shift, product)
 
 
 @njit(cache=True)
@@ -145,9 +145,9 @@ def multiply_packed(a, weight, shift, product):
     groups, inner, _ = weight.shape
     _check(a, inner, 0 <= groups * LANES - product.shape[1] < LANES, shift, product)
     if product.shape[1] >= LANES:
-        _multiply(a, weight.ravel(), shift, product, LANES, inner * LANES)
+        _multiply(a, weight.reshape(-1), shift, product, LANES, inner * LANES)
     else:
-        _multiply_narrow(a, weight.ravel(), shift, product)
+        _multiply_narrow(a, weight.reshape(-1), shift, product)
 
 
 @njit(cache=True)
@@ -179,7 +179,7 @@ def _widened(values):
 
 
 @njit(cache=True)
-def _multiply(a, weight, shift, product, below, beside):
+def _multiply(a, weight, shift, product, below, near):
     """Multiply tile by tile. The last tiles may overlap the ones before, and then write the same values again."""
     rows, columns = product.shape
     is_fewer = -(-rows // _FEWER_ROWS) * _FEWER_ROWS < -(-rows // _ROWS) * _ROWS
@@ -192,23 +192,23 @@ def _multiply(a, weight, shift, product, below, beside):
     while group < groups:
         wide = (group + vectors) * LANES <= columns
         column = min(group * LANES, columns - LANES)
-        start = group * beside if below == LANES else column
+        start = group * near if below == LANES else column
         for first in range(0, rows, height):
             row = min(first, rows - height)
             if wide and height == _TEN:
-                _ten_wide(a, weight, shift, product, row, column, start, below, beside)
+                _ten_wide(a, weight, shift, product, row, column, start, below, near)
             elif wide and height == _ROWS:
-                _tile_wide(a, weight, shift, product, row, column, start, below, beside)
+                _tile_wide(a, weight, shift, product, row, column, start, below, near)
             elif wide and height == _FEWER_ROWS:
-                _fewer_wide(a, weight, shift, product, row, column, start, below, beside)
+                _fewer_wide(a, weight, shift, product, row, column, start, below, near)
             elif wide:
-                _row_wide(a, weight, shift, product, row, column, start, below, beside)
+                _row_wide(a, weight, shift, product, row, column, start, below, near)
             elif height == _TEN:
-                _ten_narrow(a, weight, shift, product, row, column, start, below, beside)
+                _ten_narrow(a, weight, shift, product, row, column, start, below, near)
             elif height == _ROWS:
-                _tile_narrow(a, weight, shift, product, row, column, start, below, beside)
+                _tile_narrow(a, weight, shift, product, row, column, start, below, near)
             elif height == _FEWER_ROWS:
-                _fewer_narrow(a, weight, shift, product, row, column, start, below, beside)
+                _fewer_narrow(a, weight, shift, product, row, column, start, below, near)
             else:
-                _row_narrow(a, weight, shift, product, row, column, start, below, beside)
+                _row_narrow(a, weight, shift, product, row, column, start, below, near)
         group += vectors if wide else 1
