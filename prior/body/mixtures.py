@@ -43,5 +43,4 @@ def mixed(lacking: Bools) -> Bools:
 
 def mix(positions: Floats, lacking: Bools) -> Floats:
     """Return positions (..., 22, 3) with means in place of `mixed` joints."""
-    means = np.einsum("jk,...ka->...ja", SHARES, positions)
-    return np.where(mixed(lacking)[..., None], means, positions)
+    return np.where(mixed(lacking)[..., None], SHARES @ positions, positions)

@@ -77,7 +77,7 @@ def mix(estimate: Estimate, unseen_s: Floats) -> Estimate:
     lacking = np.isinf(unseen_s) & np.isfinite(estimate.positions[:, :1, 0])
     if not (mixed := mixtures.mixed(lacking)).any():
         return estimate
-    of_parts = np.einsum("jk,sk->sj", np.square(mixtures.SHARES), np.square(estimate.sigma))
+    of_parts = np.square(estimate.sigma) @ np.square(mixtures.SHARES).T
     return replace(
         estimate,
         positions=mixtures.mix(estimate.positions, lacking),
