@@ -156,14 +156,10 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
             f"{axis} is the same for all joints, as in 2D key points without depth: expected three coordinates in "
             "metres; if you have a depth image, from_coco lifts key points to 3D (docs/sources.md)",
         )
-    stamps = {raw.stamp_ns for raw in messages}
+    stamps = {raw.stamp_ns for raw in messages if raw.bodies}
     if len(stamps) >= ENOUGH and len(joints) >= len(messages):
-        same = all(
-            np.array_equal(a.positions, b.positions, equal_nan=True)
-            for raw in messages[1:]
-            for a, b in zip(raw.bodies[:1], messages[0].bodies[:1], strict=False)
-        )
-        if same:
+        first, *others = (raw.bodies[0].positions for raw in messages if raw.bodies)
+        if all(np.array_equal(first, other, equal_nan=True) for other in others):
             return error(
                 "frozen",
                 f"the joints are identical to the last bit in {len(messages)} messages with {len(stamps)} "

@@ -251,6 +251,12 @@ def test_who_walks_in_and_out_has_another_id_of_good_right() -> None:
     assert not told([come(raw, index) for index, raw in enumerate(walk())])
 
 
+def test_people_who_enter_an_empty_room_are_not_frozen() -> None:
+    nobody, *others = walk()
+    two = bodies(lambda it: [it, moved(it, 1.0, 2)])
+    assert not told([dataclasses.replace(nobody, bodies=[]), *(two(raw, index) for index, raw in enumerate(others))])
+
+
 @pytest.mark.parametrize("name", STREAMS)
 def test_recorded_streams_have_no_problem(name: str) -> None:
     frames = [message for _, message in open_recording(PACKAGE / "sim_data" / name) if isinstance(message, PoseRaw)]
