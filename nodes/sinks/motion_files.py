@@ -133,6 +133,10 @@ def _from_recording(path: Path, body: int | None) -> tuple[Floats, Floats, Float
     return stamps / 1e9, positions, rotations
 
 
+RIGID = [J[name] for name in JOINTS if not name.endswith(("pelvis", "hip", "knee", "ankle", "foot"))]
+"""Joints that `pose/world` rotates and shifts only; it also moves the others, so that feet stand."""
+
+
 def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
     arrays = read_arrays(path)
     if missing := {"positions", "world_positions", "rotations"} - arrays.keys():
@@ -149,13 +153,11 @@ def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
     else:
         _chosen(path, Counter({0: 1}), body)  # a file of one body has no ids; `as_input` calls it 0
     stamps = read_stamps(path, arrays, len(seen)) / 1e9
-    # the rotations are in the sensor's frame; a single rotation transforms the whole file to the world
+    # the pelvis' rotation is in the sensor's frame, which may move: from there to the world, spine and arms are rigid
     known = np.isfinite(seen).all(axis=(1, 2)) & np.isfinite(world).all(axis=(1, 2))
-    if known.any():
-        shapes = [(p[known] - p[known][:, :1]).reshape(-1, 3) for p in (seen, world)]
-        turn = Rotation.from_matrix(rigid_alignment(*shapes)[0])
-        present = np.isfinite(turned[:, 0]).all(axis=1)
-        turned[present, 0] = (turn * Rotation.from_quat(turned[present, 0])).as_quat()
+    for row in np.flatnonzero(known & np.isfinite(turned[:, 0]).all(axis=1)):
+        turn = Rotation.from_matrix(rigid_alignment(seen[row, RIGID], world[row, RIGID])[0])
+        turned[row, 0] = (turn * Rotation.from_quat(turned[row, 0])).as_quat()
     return stamps, world, turned
 
 

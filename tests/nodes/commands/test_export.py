@@ -47,14 +47,16 @@ def motion() -> BodyMotion:
 def npz(
     path: Path, motion: BodyMotion, turn: Rotation | None = None, gap: slice = slice(0), backwards: bool = False
 ) -> Path:
-    """What ``clean`` writes of it, from a sensor whose axes are turned, without anybody in a gap."""
+    """What ``clean`` writes of it, from a sensor whose axes are turned, in all frames or in each, without anybody in a
+    gap."""
     turn = turn or Rotation.identity()
     rotations = motion.rotations.copy()
     rotations[:, 0] = (turn * Rotation.from_quat(rotations[:, 0])).as_quat()
     world = motion.positions
     rotations[gap] = world[gap] = np.nan
     stamps = np.round(np.arange(FRAMES) * 1e9 / 30).astype(np.int64)[:: -1 if backwards else 1]
-    np.savez(path, positions=world @ turn.as_matrix().T, world_positions=world, rotations=rotations, stamp_ns=stamps)
+    seen = world @ turn.as_matrix().swapaxes(-1, -2)
+    np.savez(path, positions=seen, world_positions=world, rotations=rotations, stamp_ns=stamps)
     return path
 
 
@@ -156,8 +158,9 @@ def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, mot
     assert len(np.unique(values(primitive.indices))) == len(points)
 
 
-def test_an_npz_of_a_turned_sensor_is_exported_in_the_world(tmp_path: Path, motion: BodyMotion) -> None:
-    found = read_motion(npz(tmp_path / "clean.npz", motion, Rotation.from_euler("xyz", [1.5, 0.2, -2.0])))
+@pytest.mark.parametrize("angles", [[1.5, 0.2, -2.0], np.outer(np.arange(FRAMES), [0.01, 0.0, 0.02])])
+def test_an_npz_of_a_turned_sensor_is_exported_in_the_world(tmp_path: Path, motion: BodyMotion, angles: Floats) -> None:
+    found = read_motion(npz(tmp_path / "clean.npz", motion, Rotation.from_euler("xyz", angles)))
     assert found.fps == pytest.approx(30.0)
     np.testing.assert_allclose(found.positions, motion.positions, atol=1e-6)
 
