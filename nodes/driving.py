@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,7 +72,8 @@ class Diagnosis:
         self._check = StreamCheck(settings)
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
-        self._last_ns = self._span_ns = self._back_ns = 0
+        self._span_ns = self._back_ns = 0
+        self._stamps_ns: deque[int] = deque(maxlen=4)
         self._useless = False
         self._inhabited = self._looks = self._lying = 0
         self.frames = 0
@@ -81,10 +82,13 @@ class Diagnosis:
         """Add the next frame without examining it yet."""
         self._check.see(raw, self.frames * CHECKED_NS // CHECKED)
         if self._first_ns is None:
-            self._first_ns = self._last_ns = raw.stamp_ns
+            self._first_ns = raw.stamp_ns
+            self._stamps_ns.extend([raw.stamp_ns] * 3)
         self._span_ns = max(self._span_ns, abs(raw.stamp_ns - self._first_ns))
-        self._back_ns = max(self._back_ns, self._last_ns - raw.stamp_ns)
-        self._last_ns = raw.stamp_ns
+        self._stamps_ns.append(raw.stamp_ns)
+        before, last, back, after = self._stamps_ns
+        if min(before, last) > max(back, after):  # a single wrong stamp is dropped, and the stream goes on
+            self._back_ns = max(self._back_ns, last - back)
         self.frames += 1
 
     def look(self) -> list[str]:
