@@ -127,10 +127,12 @@ class Fitted(NamedTuple):
     """the fit of each body over the time that it was observed"""
     problems: list[str]
     """what is wrong with the source's joints"""
+    bodies: tuple[int, ...]
+    """ids along the source's axis of bodies, if it has one"""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, one row per frame. If exactly one body was fitted, also its bones and the ground."""
-        arrays = NpzCollector(self.messages).arrays(self.stamps_ns)
+        arrays = NpzCollector(self.messages, self.bodies).arrays(self.stamps_ns)
         tracks = {fit.seen.id: fit.track for fit in self.fits if fit.track is not None}
         return with_bones(arrays, next(iter(tracks.values()))) if len(tracks) == 1 else arrays
 
@@ -180,7 +182,8 @@ def fit_source(
         )
     raws = [message for _, message in messages if isinstance(message, PoseRaw)]
     stamps = np.array([raw.stamp_ns for raw in raws if not raw.end_of_stream], np.int64)
-    return Fitted(rewritten(messages, fits), stamps, fits, _problems(raws))
+    bodies = frames.bodies if isinstance(frames, ArraySource) else ()
+    return Fitted(rewritten(messages, fits), stamps, fits, _problems(raws), bodies)
 
 
 def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str, NDArray[Any]]:
