@@ -167,7 +167,9 @@ def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
         NpzError: the value is not an array: lists of different lengths, or of something other than numbers.
     """
     try:
-        array = np.asarray(value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else value)
+        if isinstance(value, np.ma.MaskedArray) and value.mask.any():
+            value = np.ma.filled(value.astype(np.float64), np.nan)  # as a bool, NaN would be True
+        array = np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as error:
         raise NpzError(
             f"{name}: expected numbers of one shape, got {type(value).__name__} ({error}); frames without a "
@@ -317,7 +319,8 @@ def fit(
     from steadypose.nodes.offline import fit_source, load_transitions
 
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
-    fitted = fit_source(source, points, model=load_transitions(weights), delay=delay)
+    surface = None if points is None else as_array("points", points)
+    fitted = fit_source(source, surface, model=load_transitions(weights), delay=delay)
     problems = [f"body {fit.seen.id}: not explained, left as `clean` has it" for fit in fitted.fits if not fit.track]
     problems += fitted.problems
     warn(problems)

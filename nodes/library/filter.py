@@ -32,6 +32,7 @@ from steadypose.nodes.library.arrays import (
 )
 from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sinks.arrays import NpzCollector
+from steadypose.nodes.sources.npz import STAMPS_END_NS
 from steadypose.nodes.timeline import FrameEvents, TimedEvent
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.clean.pipeline import load_loops
@@ -259,13 +260,17 @@ def _stamp(t: float | None, stamp_ns: int | None) -> int:
             f"expected the time of capture, as t in seconds or as stamp_ns, got {got}: cleaner(joints, time.time())"
         )
     if stamp_ns is not None:
-        if not isinstance(stamp_ns, Real) or isinstance(stamp_ns, np.timedelta64) or stamp_ns != round(stamp_ns):
-            raise FilterError(f"stamp_ns: expected whole nanoseconds, got {stamp_ns!r}; seconds are t")
+        number = isinstance(stamp_ns, Real) and not isinstance(stamp_ns, np.timedelta64)
+        if not number or not 0 <= stamp_ns < STAMPS_END_NS or stamp_ns != round(stamp_ns):
+            raise FilterError(
+                f"stamp_ns: expected whole nanoseconds of 0 or more and under {STAMPS_END_NS}, got {stamp_ns!r}; "
+                "seconds are t"
+            )
         return int(stamp_ns)
     if isinstance(t, timedelta | np.timedelta64):
         raise FilterError(f"t: expected a number of seconds, got {t!r}; t / np.timedelta64(1, 's')")
     if not isinstance(t, Real) or isinstance(t, bool) or not math.isfinite(t) or t < 0:
-        raise FilterError(f"t: expected seconds of 0 or more, got {t!r}")
+        raise FilterError(f"t: expected a number of seconds, 0 or more, got {t!r}")
     if t >= 2**31:
         raise FilterError(f"t: expected seconds, got {t!r}; say stamp_ns= of nanoseconds, divide milliseconds by 1000")
     return round(t * 1e9)

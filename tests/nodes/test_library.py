@@ -11,7 +11,7 @@ from tests.nodes.conftest import walked, write_npz
 import steadypose
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.cli import main
-from steadypose.nodes.library.arrays import source_of
+from steadypose.nodes.library.arrays import as_array, source_of
 from steadypose.prior.body.skeleton import J
 
 ROOT = Path(__file__).parents[2]
@@ -102,12 +102,24 @@ def test_a_mask_of_what_was_seen_is_a_confidence() -> None:
     assert live[-1].state[15] == steadypose.JointState.IMPUTED
 
 
+@pytest.mark.parametrize("wrong_s", [0, 500])
+def test_a_single_wrong_stamp_is_dropped_without_a_warning_that_the_stream_starts_anew(wrong_s: int) -> None:
+    stamps = np.round(100e9 + np.arange(FRAMES) * 1e9 / 30).astype(np.int64)
+    stamps[20] = wrong_s * 10**9
+    poses = steadypose.clean(WALK, stamp_ns=stamps)
+    assert (poses.refused, poses.problems) == ({"stamp_outlier": 1}, ())
+
+
 def test_what_is_masked_is_missing() -> None:
     joints = walked(3)
     masked = np.ma.masked_array(joints, np.zeros(joints.shape, bool))
     masked[1, J["left_wrist"]] = np.ma.masked
     raws = [message for _, message in source_of(masked, fps=30) if isinstance(message, PoseRaw)]
     assert np.unique(np.argwhere(np.isnan(raws[1].bodies[0].positions))[:, 0]).tolist() == [J["left_wrist"]]
+    assert as_array("confidence", np.ma.masked_array([True, True], [False, True])).tolist() == pytest.approx(
+        [1.0, np.nan], nan_ok=True
+    )
+    assert as_array("stamp_ns", np.ma.masked_array([1, 2])).dtype.kind == "i"
 
 
 def test_frames_of_confidence_zero_are_not_missed() -> None:
@@ -219,3 +231,7 @@ def test_a_fit_is_that_of_the_command(tmp_path: Path) -> None:
     with np.load(tmp_path / "out.npz") as written:
         assert set(poses) == set(written)
         np.testing.assert_allclose(poses.positions, written["positions"], atol=1e-4)
+    of_bodies = steadypose.fit(np.stack([np.full_like(joints, np.nan), joints], axis=1), fps=30.0)
+    assert of_bodies.positions.shape == (40, 2, 22, 3)
+    with pytest.raises(ValueError, match="points: expected numbers of one shape"):
+        steadypose.fit(joints, fps=30.0, points=[joints[0], joints[1, :5]])

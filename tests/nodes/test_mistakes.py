@@ -134,11 +134,15 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     ),
     "seconds as a timedelta": (lambda j: Filter()(j[0], timedelta(seconds=1)), "t: expected a number of seconds"),
     "nanoseconds of numpy": (lambda j: Filter()(j[0], stamp_ns=np.timedelta64(1, "ns")), "expected whole nanoseconds"),
-    "true for seconds": (lambda j: Filter()(j[0], True), "t: expected seconds of 0 or more, got True"),
-    "seconds as text": (lambda j: Filter()(j[0], "0.1"), "t: expected seconds of 0 or more, got '0.1'"),
+    "true for seconds": (lambda j: Filter()(j[0], True), "t: expected a number of seconds, 0 or more, got True"),
+    "seconds as text": (lambda j: Filter()(j[0], "0.1"), "t: expected a number of seconds, 0 or more, got '0.1'"),
     "seconds as nanoseconds": (
         lambda j: Filter()(j[0], stamp_ns=1.7e9 + 0.3),
-        "stamp_ns: expected whole nanoseconds, got 1700000000.3; seconds are t",
+        "stamp_ns: expected whole nanoseconds of .*, got 1700000000.3; seconds are t",
+    ),
+    "a stamp that is not known": (
+        lambda j: Filter()(j[0], stamp_ns=np.nan),
+        "expected whole nanoseconds of .*, got nan",
     ),
     "names for ids": (
         lambda j: Filter()(j[:1], 0.1, ids=["anna"]),
