@@ -288,6 +288,8 @@ def points_of_depth(depth: NDArray[np.integer], lens: Intrinsics) -> Floats:
             f"got {width} x {height}"
         )
     rows, columns = np.nonzero(depth)
+    if not len(rows):  # which OpenCV does not undistort
+        return np.zeros((0, 3))
     z = depth[rows, columns].astype(np.float64) / 1000.0
     pixels = np.stack([columns, rows], axis=-1).astype(np.float64)
     rays = cv2.undistortPoints(pixels[:, None], lens.matrix, lens.coefficients).reshape(-1, 2)
@@ -329,5 +331,10 @@ def floor_pose(points: Floats, up: Floats) -> tuple[Pose, float]:
         axes = np.linalg.eigh(np.cov((on_floor - middle).T))[1]
         normal = axes[:, 0] * np.sign(axes[:, 0] @ up)
         height = float(normal @ middle)
+    if height > 0:
+        raise CalibrationError(
+            f"expected the floor below the camera, got a plane {height:.2f} m above it: is the direction upwards? That "
+            "of gravity is downwards: negate it"
+        )
     share = float((np.abs(points @ normal - height) < FLOOR_SLACK).mean())
     return Pose(np.array([0.0, 0.0, -height]), level_pose(normal).orientation), share

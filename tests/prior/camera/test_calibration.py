@@ -152,6 +152,11 @@ def test_a_view_without_a_floor_is_refused() -> None:
         floor_pose(wall, np.array([0.0, -1.0, 0.0]))
     with pytest.raises(CalibrationError, match="100 points"):
         floor_pose(np.full((500, 3), np.nan), np.array([0.0, -1.0, 0.0]))
+    with pytest.raises(CalibrationError, match="got 0"):
+        floor_pose(points_of_depth(np.zeros((720, 1280), np.uint16), LENS), np.array([0.0, -1.0, 0.0]))
+    down = Rotation.from_quat(EYE.orientation).inv().apply([0.0, 0.0, -1.0])
+    with pytest.raises(CalibrationError, match=r"a plane 1\.20 m above it: is the direction upwards"):
+        floor_pose(depth_points(EYE, rng), down)
 
 
 def test_points_of_depth_lie_on_their_pixels_rays() -> None:
