@@ -19,6 +19,8 @@ def test_each_row_changes_one_setting_and_every_stage_that_is_on_has_a_row() -> 
     stages = {f.name for f in fields(default) if is_dataclass(getattr(default, f.name))}
     switches = {f"{stage}.enabled" for stage in stages if getattr(getattr(default, stage), "enabled", False)}
     assert set.union(*changed.values()) == {"bias_sigma", "refine.enabled", *switches}
+    changed = [_changed(TrajectorySettings(), settings) for settings in PARTS_OF_THE_WORLD.values()]
+    assert changed == [set(), {"contacts"}, {"network"}, {"contacts", "network"}]
 
 
 def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
@@ -33,11 +35,6 @@ def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
         with PARTS[name].replaced():
             assert np.nanmax(np.abs(positions() - shipped)) > 1e-4
     np.testing.assert_array_equal(positions(), shipped)
-
-
-def test_the_worlds_switches_are_each_off_alone_and_both() -> None:
-    changed = [_changed(TrajectorySettings(), settings) for settings in PARTS_OF_THE_WORLD.values()]
-    assert changed == [set(), {"contacts"}, {"network"}, {"contacts", "network"}]
 
 
 def test_a_row_is_in_units_of_what_ships_and_every_person_counts_once() -> None:

@@ -3,21 +3,13 @@ from functools import partial
 import numpy as np
 import pytest
 
+from steadypose.benchmarks.baselines import filters
 from steadypose.benchmarks.baselines.banks import bank, noise_found, whole_body_bank
-from steadypose.benchmarks.baselines.body import beside
-from steadypose.benchmarks.baselines.filters import (
-    BASELINES,
-    FILTERS,
-    OFFLINE,
-    butterworth,
-    constant_velocity,
-    constant_velocity_by_joint,
-    gaussian_hampel,
-    hold_last,
-    interpolate,
-    one_euro,
-)
+from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
+from steadypose.benchmarks.baselines.filters import BASELINES, FILTERS, OFFLINE, interpolate, one_euro
 from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
+from steadypose.benchmarks.studies.hidden_joints import given_the_seen
+from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
@@ -72,7 +64,7 @@ def test_constant_acceleration_is_the_smoother_of_its_model() -> None:
 def test_a_gap_is_bridged_only_when_its_end_is_known() -> None:
     seen, stamps = line([0.0, 1.0, NAN, NAN, 4.0, NAN, 6.0]), np.arange(7.0)
     for run, delay, expected in (
-        (hold_last, 0, [0, 1, 1, 1, 4, 4, 6]),
+        (filters.hold_last, 0, [0, 1, 1, 1, 4, 4, 6]),
         (interpolate, 0, [0, 1, 1, 1, 4, 4, 6]),
         (interpolate, 1, [0, 1, 1, 3, 4, 5, 6]),
         (interpolate, 2, [0, 1, 2, 3, 4, 5, 6]),
@@ -86,7 +78,7 @@ def test_a_spike_is_taken_out_before_the_mean() -> None:
     seen = np.random.default_rng(3).normal(0, 0.01, (40, 3, 2, 3))
     struck = seen.copy()
     struck[20, 1, 1] += 0.3
-    run = partial(gaussian_hampel, stamps_s=STAMPS, delay=4, sigma_s=0.05)
+    run = partial(filters.gaussian_hampel, stamps_s=STAMPS, delay=4, sigma_s=0.05)
     clean = run(seen, threshold=8.0)
     assert np.abs(run(struck, threshold=8.0) - clean).max() < 0.03
     assert np.abs(run(struck, threshold=1e6) - run(seen, threshold=1e6)).max() > 0.03
@@ -97,7 +89,7 @@ def test_butterworth_has_no_lag_and_bridges_gaps() -> None:
     truth = np.sin(2 * np.pi * 0.5 * stamps)[:, None, None] * np.ones((1, 1, 3))
     seen = truth.copy()
     seen[50:53] = np.nan
-    answer = butterworth(seen, stamps, OFFLINE, cutoff_hz=4.0)
+    answer = filters.butterworth(seen, stamps, OFFLINE, cutoff_hz=4.0)
     assert np.abs(answer - truth)[20:100].max() < 0.02
 
 
@@ -138,7 +130,9 @@ def test_the_bank_is_true_to_what_is_clean_and_smooths_what_is_noisy_without_bei
     assert error[2] < 1.3 * raw[2]
 
 
-def test_the_bank_finds_the_noise() -> None:
+def test_the_bank_finds_the_noise_and_that_of_whole_bodies_refuses_a_choice_of_joints() -> None:
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 22, 3\) canonical joints"):
+        whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
     rng = np.random.default_rng(7)
     moving = 2.0 * STAMPS[:, None, None, None] * np.ones((1, 2, 5, 3))
     for sigma in (0.002, 0.05):
@@ -164,17 +158,12 @@ def test_a_hidden_joint_stays_beside_the_nearest_seen_one_and_turns_with_the_tru
     assert np.isnan(beside(gone, STAMPS, 0)).all()
 
 
-def test_the_whole_body_bank_refuses_a_choice_of_joints() -> None:
-    with pytest.raises(ValueError, match=r"expected \(\.\.\., 22, 3\) canonical joints"):
-        whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
-
-
 def test_a_density_a_joint_follows_a_wrist_more_closely_than_a_hip() -> None:
     seen = np.zeros((12, 1, 22, 3))
     seen[-1] = 0.1  # all joints jump alike
-    moved = constant_velocity_by_joint(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, :, 0]
+    moved = filters.constant_velocity_by_joint(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, :, 0]
     assert moved[J["left_wrist"]] > moved[J["left_hip"]] > 0.0
-    same = constant_velocity(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, 0, 0]
+    same = filters.constant_velocity(seen, np.arange(12) / 30, 0, 0.5)[-1, 0, 0, 0]
     assert moved.min() < same < moved.max()
 
 
@@ -201,3 +190,68 @@ def test_one_euro_is_the_papers_algorithm_between_gaps() -> None:
         assert np.isnan(got[: seen[0], joint]).all()
         for frame in set(range(seen[0], len(stamps))) - set(seen.tolist()):
             np.testing.assert_array_equal(got[frame, joint], got[frame - 1, joint])
+
+
+ELBOW, WRIST, HEAD = J["left_elbow"], J["left_wrist"], J["head"]
+
+
+def poses(count: int, seed: int) -> np.ndarray:
+    """Bodies anywhere, facing anywhere: an elbow moves at random, the wrist by 0.6 of it and by as much at random."""
+    rng = np.random.default_rng(seed)
+    body = np.tile(REST_POSITIONS, (count, 1, 1))
+    swing, own = 0.1 * rng.standard_normal((2, count, 3))
+    body[:, ELBOW] += swing
+    body[:, WRIST] += 0.6 * swing + own
+    body[:, HEAD] += 0.05 * rng.standard_normal((count, 3))
+    turn = yaw_matrix(rng.uniform(-np.pi, np.pi, count))
+    return body @ turn.swapaxes(-1, -2) + rng.uniform(-3, 3, (count, 1, 3))
+
+
+@pytest.fixture(scope="module")
+def gaussian() -> ConditionalGaussian:
+    return ConditionalGaussian(poses(20_000, 0))
+
+
+def test_a_hidden_joint_is_the_regression_on_the_seen_ones(gaussian: ConditionalGaussian) -> None:
+    """Closed form: E[wrist | elbow] = rest + 0.6 (elbow - rest), whatever else is seen, place and heading."""
+    rng = np.random.default_rng(1)
+    body, angle, place = np.array(REST_POSITIONS), rng.uniform(-np.pi, np.pi), rng.uniform(-3, 3, 3)
+    swing = np.array([0.1, -0.05, 0.2])
+    body[ELBOW] += swing
+    expected = body[WRIST] + 0.6 * swing
+    turn = yaw_matrix(np.array(angle))
+    seen = body @ turn.T + place
+    seen[WRIST] = np.nan
+    found = gaussian(seen[None, None])[0, 0]
+    np.testing.assert_allclose(found[WRIST], turn @ expected + place, atol=5e-3)
+    np.testing.assert_array_equal(np.delete(found, WRIST, axis=0), np.delete(seen, WRIST, axis=0))
+
+
+def test_hidden_joints_that_nothing_tells_of_are_at_their_means(gaussian: ConditionalGaussian) -> None:
+    seen = np.array(REST_POSITIONS)
+    seen[[WRIST, ELBOW]] = np.nan
+    np.testing.assert_allclose(gaussian(seen)[[WRIST, ELBOW]], REST_POSITIONS[[WRIST, ELBOW]], atol=5e-3)
+    # with a heading that is given also without hips and shoulders
+    truth = np.einsum("nab,jb->nja", yaw_matrix(np.array([0.3, 2.0])), REST_POSITIONS)
+    seen = truth.copy()
+    seen[:, [J[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "shoulder")]] = np.nan
+    np.testing.assert_allclose(gaussian(seen, np.array([0.3, 2.0])), truth, atol=5e-3)
+
+
+@pytest.mark.parametrize("hidden", [[], [J["pelvis"]], [J["left_hip"], WRIST], list(range(22))])
+def test_without_a_frame_to_answer_in_it_answers_nothing(hidden: list[int]) -> None:
+    seen = poses(3, 2)
+    seen[:, hidden] = np.nan
+    np.testing.assert_array_equal(ConditionalGaussian(poses(100, 0))(seen), seen)
+
+
+def test_one_shoulder_and_both_hips_give_a_heading_and_without_any_a_joint_is_held_beside_the_body() -> None:
+    gaussian, turn = ConditionalGaussian(poses(20_000, 0)), yaw_matrix(np.array([0.3, 2.0]))
+    truth = np.tile(np.einsum("nab,jb->nja", turn, REST_POSITIONS), (12, 1, 1, 1))
+    seen = truth.copy()
+    seen[:, :, [J["left_shoulder"], ELBOW, WRIST]] = np.nan
+    found = given_the_seen(seen, np.arange(12) / 30, 4, gaussian)
+    np.testing.assert_allclose(found, truth, atol=5e-3)
+    seen[6:, :, [J["right_hip"], J["right_shoulder"]]] = np.nan
+    found = given_the_seen(seen, np.arange(12) / 30, 4, gaussian)[:, :, J["right_shoulder"]]
+    np.testing.assert_allclose(found, truth[:, :, J["right_shoulder"]], atol=5e-3)

@@ -32,7 +32,7 @@ def test_a_fault_changes_windows_and_leaves_the_clean_ones_alone(name: str) -> N
     assert all(np.abs(corrupted[k] - clean[k]).max() > 0 for k in np.flatnonzero(holds))
 
 
-def test_a_joint_counts_as_frozen_only_where_it_would_have_moved() -> None:
+def test_a_joint_counts_as_frozen_only_where_it_would_have_moved_and_left_for_right_is_the_other_sides() -> None:
     still = np.repeat(waving(1)[None], 50, axis=1)
     corrupted, holds = FAULTS["a joint frozen"](
         np.concatenate([still, waving(50, speed=3)[None]]), np.random.default_rng(0)
@@ -41,9 +41,6 @@ def test_a_joint_counts_as_frozen_only_where_it_would_have_moved() -> None:
     stopped = np.ptp(corrupted[1, BEGINS - 1 :], axis=0).max(axis=-1) == 0
     assert stopped.sum() == 1
     assert np.linalg.norm(corrupted[1] - waving(50, speed=3), axis=-1)[:, stopped].max() > MIN_MOTION
-
-
-def test_left_for_right_is_the_other_sides_joint() -> None:
     clean = waving(50)[None]
     corrupted, _ = FAULTS["left taken for right"](clean, np.random.default_rng(0))
     np.testing.assert_array_equal(corrupted[0, :, J["left_wrist"]], clean[0, :, MIRROR[J["left_wrist"]]])

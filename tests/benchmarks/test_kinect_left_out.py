@@ -254,6 +254,11 @@ def test_each_persons_offset_is_learned_on_the_others_and_who_is_out_of_step_is_
         assert record["bone_variation_percent"] == round(100 * every.mean(), 3)
     assert "s01" in result.tables[0].note
     assert result.data["data"]["clips"] == result.data["data"]["learning_clips"] == 2 * len(people)
+    rows, raw = {(row[0], row[1]): row for row in result.tables[0].rows}, records["raw", 0]
+    low, high = raw["moving_ci_mm"]
+    assert rows["raw", "0"][3] == f"{raw['moving_mm']:.1f} ({low:.1f}–{high:.1f})"
+    assert rows["raw", "0"][4:12] == [f"{raw['people_mm'][who]:.1f}" for who in people]
+    assert (BEST, "offline") in rows
 
 
 def test_what_is_stated_is_compared_with_each_persons_errors(result: Result) -> None:
@@ -269,12 +274,3 @@ def test_what_is_stated_is_compared_with_each_persons_errors(result: Result) -> 
             assert row[1] == f"{expected['rank_correlation']:.2f}"
             assert row[-1] == f"{expected['flagged_percent']:.2f}" == "15.00"
         assert f"{name}, delay 4" in result.data["reliability"]
-
-
-def test_the_table_has_a_row_a_method_and_delay(result: Result) -> None:
-    (raw,) = (record for record in result.data["records"] if record["method"] == "raw")
-    rows = {(row[0], row[1]): row for row in result.tables[0].rows}
-    low, high = raw["moving_ci_mm"]
-    assert rows["raw", "0"][3] == f"{raw['moving_mm']:.1f} ({low:.1f}–{high:.1f})"
-    assert rows["raw", "0"][4:12] == [f"{raw['people_mm'][who]:.1f}" for who in kinect_vicon.SUBJECTS]
-    assert (BEST, "offline") in rows

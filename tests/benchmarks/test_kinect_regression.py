@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 import torch
 
+from steadypose.benchmarks.baselines import kinect_regression
 from steadypose.benchmarks.baselines.kalman import fixed_lag
 from steadypose.benchmarks.baselines.kinect_regression import (
     _OTHER_SIDE,
     Smoothed,
     _mirrored,
-    look_ahead,
     ridge,
-    smoothed,
     temporal_convolution,
 )
 from steadypose.benchmarks.metrics import position_error
@@ -66,7 +65,7 @@ def test_a_clip_is_smoothed_with_the_part_of_the_delay_that_is_not_looked_ahead(
     rng, scored = np.random.default_rng(3), [J[name] for name in SCORED]
     clips = [rng.normal(0, 0.4, (22, 3)) + np.cumsum(rng.normal(0, 0.02, (n, 22, 3)), axis=0) for n in (30, 12)]
     for ahead in (0, 3):
-        found = smoothed(clips, scored, delay=4, ahead=ahead, density=2.0)
+        found = kinect_regression.smoothed(clips, scored, delay=4, ahead=ahead, density=2.0)
         for clip, one in zip(clips, found, strict=True):
             late, early = (fixed_lag(clip[:, None], np.arange(len(clip)) / 30, d, 2, 2.0)[:, 0] for d in (4, 4 - ahead))
             bodies = [to_canonical(KINECT22, seen)[0] for seen in (late, early)]
@@ -75,7 +74,7 @@ def test_a_clip_is_smoothed_with_the_part_of_the_delay_that_is_not_looked_ahead(
             np.testing.assert_allclose(one.trunk, trunks[0])
             hips = (bodies[1][:, J["left_hip"]] + bodies[1][:, J["right_hip"]])[:, None] / 2
             np.testing.assert_allclose(one.inputs, ((early - hips) @ trunks[1]).reshape(len(clip), -1), atol=1e-12)
-    assert [look_ahead(delay) for delay in (0, 2, 4, 8)] == [0, 2, 4, 4]
+    assert [kinect_regression.look_ahead(delay) for delay in (0, 2, 4, 8)] == [0, 2, 4, 4]
 
 
 def test_what_is_missing_leads_from_the_clip_to_the_truth_that_is_moved_to_it() -> None:

@@ -26,9 +26,6 @@ def test_a_crowd_is_at_30_hz_side_by_side_and_never_jumps() -> None:
     np.testing.assert_array_equal(first, [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0, 1])
     apart = stream[0].bodies[1].positions - stream[0].bodies[0].positions
     np.testing.assert_allclose(apart, np.tile([SPACING, 0.0, 0.0], (22, 1)), atol=1e-6)
-
-
-def test_a_crowd_needs_a_body() -> None:
     with pytest.raises(ValueError, match="at least 2 frames"):
         next(crowd(frames(*[None] * 5), 1))
 

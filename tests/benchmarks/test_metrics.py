@@ -2,15 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.metrics import (
-    acceleration_error,
-    contact_speed,
-    length_variation,
-    position_error,
-    procrustes,
-    reliability,
-    sigma_ratio,
-)
+from steadypose.benchmarks import metrics
+from steadypose.benchmarks.metrics import position_error, procrustes, sigma_ratio
+from steadypose.benchmarks.scores import interval, people_means, ratio
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.training.data.recordings import trunk_frame
 
@@ -30,24 +24,21 @@ def test_errors_against_loops() -> None:
         for j in range(a.shape[1]):
             bend = [x[t + 1, j] - 2 * x[t, j] + x[t - 1, j] for x in (a, b)]
             np.testing.assert_allclose(
-                acceleration_error(a, b)[t - 1, j], np.linalg.norm(bend[0] - bend[1]), atol=1e-12
+                metrics.acceleration_error(a, b)[t - 1, j], np.linalg.norm(bend[0] - bend[1]), atol=1e-12
             )
 
 
-def test_length_variation_of_a_known_bone() -> None:
+def test_length_variation_of_a_known_bone_and_horizontal_speed_of_each_foot() -> None:
     positions = np.zeros((4, 3, 3))
     positions[:, 1, 0] = [0.9, 1.1, 0.9, 1.1]
     positions[:, 2, 1] = 0.5
-    assert length_variation(positions, [(0, 1)]) == pytest.approx(0.1)
-    assert length_variation(positions, [(0, 1), (0, 2)]) == pytest.approx(0.05)
-
-
-def test_contact_speed_is_horizontal_and_of_each_foot_for_itself() -> None:
+    assert metrics.length_variation(positions, [(0, 1)]) == pytest.approx(0.1)
+    assert metrics.length_variation(positions, [(0, 1), (0, 2)]) == pytest.approx(0.05)
     positions = np.zeros((4, 2, 3))
     positions[:, 0, 0] = [0.0, 0.01, 0.03, 0.03]
     positions[:, :, 2] = np.arange(4)[:, None]
     contact = np.array([[True, True], [True, False], [True, True], [False, True]])
-    speed = contact_speed(positions, contact, np.array([0.0, 0.1, 0.3, 0.4]))
+    speed = metrics.contact_speed(positions, contact, np.array([0.0, 0.1, 0.3, 0.4]))
     np.testing.assert_allclose(speed[:, 0], [0.1, 0.1, np.nan])
     np.testing.assert_allclose(speed[:, 1], [np.nan, np.nan, 0.0])
 
@@ -95,8 +86,48 @@ def test_stated_and_found_deviations() -> None:
     assert sigma_ratio(error, sigma) == pytest.approx(1.0, rel=0.02)
     assert sigma_ratio(2 * error, sigma) == pytest.approx(2.0, rel=0.02)
     sigma[:100], error[100:200] = np.inf, np.nan
-    bins = reliability(error, sigma, bins=5)
+    bins = metrics.reliability(error, sigma, bins=5)
     assert sum(count for *_, count in bins) == 19_800
     for stated, found, _ in bins:
         assert found == pytest.approx(stated, rel=0.05)
     assert [stated for stated, *_ in bins] == sorted(stated for stated, *_ in bins)
+
+
+def test_every_person_counts_once_however_often_recorded() -> None:
+    found = interval([1.0] * 90 + [4.0] * 3, ["much recorded"] * 90 + ["seldom"] * 3)
+    assert (found.mean, found.people) == (pytest.approx(2.5), 2)
+    own = np.random.default_rng(0).normal(size=8)
+    people = np.array([f"p{k}" for k in range(8)])
+    few, many = interval(own, people), interval(np.repeat(own, 50), np.repeat(people, 50))
+    assert many == pytest.approx(few)
+    # Eight people of spread 1: about 2 x 1.96 / sqrt(8), a little less by the bootstrap of so few.
+    assert many.high - many.low == pytest.approx(2 * 1.96 * own.std() / np.sqrt(8), rel=0.1)
+
+
+def test_the_interval_covers_the_mean_of_all_people() -> None:
+    covered = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        own = rng.normal(size=20)
+        clips = (own[:, None] + 0.3 * rng.normal(size=(20, 10))).ravel()
+        found = interval(clips, np.repeat([f"p{k:02}" for k in range(20)], 10))
+        covered += found.low <= 0.0 <= found.high
+    assert 0.88 <= covered / 200 <= 0.98
+
+
+def test_one_person_has_no_interval_and_nobody_no_mean() -> None:
+    alone = interval([1.0, 3.0], ["a", "a"])
+    assert (alone.mean, alone.people) == (2.0, 1)
+    assert np.isnan([alone.low, alone.high]).all()
+    nobody = interval([np.nan], ["a"])
+    assert np.isnan(nobody.mean)
+    assert nobody.people == 0
+    np.testing.assert_array_equal(people_means([np.nan, 2.0, 4.0, np.nan], ["a", "b", "b", "b"]), [3.0])
+
+
+def test_a_ratio_is_of_clips_that_both_methods_have_and_without_width_if_all_people_share_it() -> None:
+    baseline = np.random.default_rng(0).uniform(1, 5, size=12)
+    found = ratio(0.7 * baseline, baseline, ["a", "b", "c"] * 4)
+    assert [found.mean, found.low, found.high] == pytest.approx([0.7] * 3)
+    found = ratio([1.0, np.nan, 8.0], [2.0, 1.0, 2.0], ["a", "a", "b"])
+    assert found.mean == pytest.approx(np.sqrt(0.5 * 4.0))

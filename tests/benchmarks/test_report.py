@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
 from steadypose.benchmarks.report import ERRORS, Args, fill, main, overview, page, ratios
-from steadypose.benchmarks.results import PICTURES, Table, load, save
+from steadypose.benchmarks.results import PICTURES, Table, load, save, show
 from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
@@ -33,31 +34,22 @@ def saved(folder: Path, name: str = "latency", table: Table = TABLE, study: Any 
     return load(folder)[name]
 
 
-def test_a_saved_table_stands_in_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
+def test_a_saved_table_stands_in_every_block_of_the_readme_and_filling_twice_changes_nothing(tmp_path: Path) -> None:
     assert saved(tmp_path)["rows"] == [1, {"none": None}]
     readme = tmp_path / "README.md"
-    readme.write_text(TEXT)
+    readme.write_text(f"{TEXT}between\n{TEXT}")
     main(Args(readme, tmp_path / "page.md", tmp_path))
     once = readme.read_text()
-    assert "| steadypose | 0.5 | 3 |" in once
+    assert once.count("| steadypose | 0.5 | 3 |") == 2
     assert "| method | p50 | a\\|b |" in once
     assert "`steadypose evaluate latency --quick`" in once
     assert "old" not in once
     assert once.startswith("# Title\n")
-    assert once.endswith("<!-- /results -->\ntail\n")
+    assert "<!-- /results -->\ntail\nbetween\n# Title" in once
     main(Args(readme, tmp_path / "page.md", tmp_path))
     assert readme.read_text() == once
-
-
-def test_every_block_is_filled_for_itself_and_one_without_a_result_is_an_error_that_names_those_there_are(
-    tmp_path: Path,
-) -> None:
-    results = {"latency": saved(tmp_path)}
-    filled = fill(TEXT + "between\n" + TEXT, results)
-    assert filled.count("| steadypose |") == 2
-    assert "between" in filled
     with pytest.raises(KeyError, match=r"results:other.*speed"):
-        fill("<!-- results:other -->\n<!-- /results -->", results)
+        fill("<!-- results:other -->\n<!-- /results -->", {"latency": saved(tmp_path)})
 
 
 def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: Path) -> None:
@@ -70,16 +62,13 @@ def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: 
     assert "**stale: the reason**" in page(results, {"latency": "the reason"})
 
 
-def test_the_page_shows_a_studys_pictures_and_each_is_there(tmp_path: Path) -> None:
+def test_the_page_shows_a_studys_pictures_and_refuses_a_result_that_no_chapter_names(tmp_path: Path) -> None:
     result = saved(tmp_path) | {"pictures": ["noise_levels"]}
     assert "![noise levels](images/noise_levels.png)" in page({"latency": result})
-    shown = {stem for one in load().values() for stem in one.get("pictures", ())}
-    assert shown == {path.stem for path in PICTURES.glob("*_*.png")}
-
-
-def test_the_page_refuses_a_result_that_no_chapter_names(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match=r"new_study.*chapter"):
-        page({"new_study": saved(tmp_path)})
+        page({"new_study": result})
+    shown = {stem for one in load().values() for stem in one.get("pictures", ())}
+    assert shown == {path.stem for path in PICTURES.glob("*_*.png")}, "each is there"
 
 
 def record(method: str, delay: int, position: float, acceleration: float, condition: str = "2 cm") -> dict[str, Any]:
@@ -100,6 +89,8 @@ def test_the_overview_compares_with_the_nearest_baseline_of_the_cell_that_waits_
         record("steadypose", 4, 10.2, 4.0),
         record("steadypose", 0, 9.0, 8.0),
     ]
+    tiny = [record("raw", 0, 0.0, 0.0), record("steadypose", 0, 0.04, 0.01)]
+    assert list(ratios(tiny, "position_mm")) == [("2 cm, delay 0", 1.0, 1.0)], "next to nothing is equal"
     assert {name: pair for name, *pair in ratios(records, "position_mm")} == {
         "2 cm, delay 4": [pytest.approx(1.02), 0.5],
         "2 cm, delay 0": [0.9, 1.0],
@@ -120,11 +111,6 @@ def test_the_readme_says_in_how_many_cells_a_baseline_is_more_accurate() -> None
     text = " ".join((ROOT / "README.md").read_text().split())
     assert f"Of {len(cells)} cells" in text
     assert f"is more accurate in {len(worse)}, all MediaPipe's, by up to {percent} %" in text
-
-
-def test_two_errors_that_are_next_to_nothing_are_equal() -> None:
-    records = [record("raw", 0, 0.0, 0.0), record("steadypose", 0, 0.04, 0.01)]
-    assert list(ratios(records, "position_mm")) == [("2 cm, delay 0", 1.0, 1.0)]
 
 
 def test_weights_that_do_not_ship_change_no_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,3 +193,14 @@ def test_readme_and_page_hold_what_was_measured() -> None:
     readme = (ROOT / "README.md").read_text()
     assert fill(readme, results) == readme
     assert page(results) == (ROOT / "docs" / "results.md").read_text()
+
+
+def test_a_row_is_in_one_line_however_narrow_the_console() -> None:
+    row = ["1 cm: a", *(f"{k} (100–140)" for k in range(12))]
+    console = Console(width=40)
+    with console.capture() as capture:
+        show(Table("t", "wide", ["method", *(f"column {k}" for k in range(12))], [row], "A note."), console)
+    title, columns, line, note, *_ = capture.get().splitlines()
+    assert (title, note) == ("wide", "A note.")
+    assert columns.split("  ")[0] == "method"
+    assert [cell for cell in line.split("  ") if cell.strip()] == row

@@ -7,27 +7,10 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from steadypose.msgs import forms
+from steadypose.msgs import forms, types
 from steadypose.msgs.forms import Array, Integer, ListOf, States
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_TRUTH, POSE_WORLD, TOPICS
-from steadypose.msgs.types import (
-    CleanBody,
-    Diagnostics,
-    Event,
-    EventKind,
-    Hand,
-    Level,
-    Phase,
-    Pose,
-    PoseClean,
-    PoseEvents,
-    PoseRaw,
-    PoseWorld,
-    RawBody,
-    Tracking,
-    WorldBody,
-    forms_of,
-)
+from steadypose.msgs.types import Diagnostics, Pose, PoseClean, PoseEvents, PoseRaw, PoseWorld, RawBody
 
 
 def _of_form(form: Any) -> st.SearchStrategy[Any]:
@@ -46,7 +29,7 @@ def _of_form(form: Any) -> st.SearchStrategy[Any]:
 
 @st.composite
 def _raw_bodies(draw: st.DrawFn) -> RawBody:
-    joints, id = draw(st.integers(0, 40)), draw(_of_form(forms_of(RawBody)["id"]))
+    joints, id = draw(st.integers(0, 40)), draw(_of_form(types.forms_of(RawBody)["id"]))
     return RawBody(id, draw(_of_form(Array(np.float32, (joints, 3)))), draw(_of_form(Array(np.float32, (joints,)))))
 
 
@@ -56,7 +39,7 @@ def of(kind: type) -> st.SearchStrategy[Any]:
         return _raw_bodies()
     if kind is bool:
         return st.booleans()
-    own = forms_of(kind)
+    own = types.forms_of(kind)
     fields = dataclasses.fields(kind)
     return st.builds(kind, **{f.name: _of_form(own[f.name]) if f.name in own else of(f.type) for f in fields})  # type: ignore[arg-type]
 
@@ -72,7 +55,7 @@ def raw(stamp_ns: int = 0, joints: int = 32, bodies: int = 1) -> PoseRaw:
 
 def clean(stamp_ns: int = 0) -> PoseClean:
     joints = np.arange(66).reshape(22, 3)
-    body = CleanBody(
+    body = types.CleanBody(
         7, joints, np.ones((22, 4)), np.full(22, 2), np.ones(22), 0.5, True, np.ones(22), np.ones(22), joints * np.nan,
         np.zeros(22),
     )  # fmt: skip
@@ -81,7 +64,7 @@ def clean(stamp_ns: int = 0) -> PoseClean:
 
 def world(stamp_ns: int = 0) -> PoseWorld:
     joints = np.arange(66).reshape(22, 3)
-    body = WorldBody(
+    body = types.WorldBody(
         id=7,
         root_position=np.arange(3),
         root_orientation=np.array([0, 0, 0, 1]),
@@ -92,18 +75,22 @@ def world(stamp_ns: int = 0) -> PoseWorld:
         state=np.full(22, 3),
         sigma=np.ones(22),
         contacts=np.ones(8),
-        tracking=Tracking.COASTING,
+        tracking=types.Tracking.COASTING,
     )
     return PoseWorld(stamp_ns, "world", "test", np.array([0, 0, 1, 0]), [body])
 
 
 def events(stamp_ns: int = 0) -> PoseEvents:
-    event = Event(7, EventKind.POINTS, Phase.BEGINS, Hand.LEFT, 0.9, np.array([1, 0, 0]), stamp_ns)
+    event = types.Event(
+        7, types.EventKind.POINTS, types.Phase.BEGINS, types.Hand.LEFT, 0.9, np.array([1, 0, 0]), stamp_ns
+    )
     return PoseEvents(stamp_ns, "world", "test", [event])
 
 
 def diagnostics(stamp_ns: int = 0) -> Diagnostics:
-    return Diagnostics(stamp_ns, "prior", Level.WARN, "3 dropped or refused", {"rate": "30.0", "refused.nan": "3"})
+    return Diagnostics(
+        stamp_ns, "prior", types.Level.WARN, "3 dropped or refused", {"rate": "30.0", "refused.nan": "3"}
+    )
 
 
 EXAMPLES = {

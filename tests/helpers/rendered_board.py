@@ -3,7 +3,8 @@
 Perspective and lens distortion by following every pixel's ray, four rays a pixel; then blur, uneven light and noise.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -127,3 +128,12 @@ def depth_points(pose: Pose, rng: np.random.Generator) -> Floats:
     depth = 0.075 * 430.0 / (np.round(disparity * 8) / 8)
     keep = (depth > 0.4) & (depth < 8.0) & (rng.random(depth.shape) > 0.15)
     return (looks * depth[:, None])[keep]
+
+
+def write_video(path: Path, size: tuple[int, int], colours: Sequence[int | tuple[int, int, int]]) -> Path:
+    """A video at 30 Hz of images of one colour each, blue first; returns ``path``."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, size)
+    for colour in colours:
+        writer.write(np.full((size[1], size[0], 3), colour, np.uint8))
+    writer.release()
+    return path

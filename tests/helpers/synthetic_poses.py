@@ -2,32 +2,21 @@
 but a seeded generator."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from steadypose.msgs import types
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
-from steadypose.msgs.types import (
-    CONTACTS,
-    CleanBody,
-    JointState,
-    Message,
-    Pose,
-    PoseClean,
-    PoseRaw,
-    PoseWorld,
-    RawBody,
-    Tracking,
-    WorldBody,
-)
 from steadypose.prior.body.kinematics import forward_kinematics
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 FPS = 30.0
 START_NS = 1_000_000_000
-CAMERA = Pose(
+CAMERA = types.Pose(
     np.array([0.0, -4.0, 1.3]),
     (Rotation.from_euler("x", -90, degrees=True) * Rotation.from_euler("x", -5, degrees=True)).as_quat(),
 )
@@ -72,7 +61,7 @@ def sensor_joints(skeleton: Skeleton, positions: NDArray[np.float64]) -> NDArray
 
 def messages(
     seconds: float, *, bodies: int = 1, skeleton: str = "azure_kinect32", delay_frames: int = 4, seed: int = 0
-) -> Iterator[tuple[str, Message]]:
+) -> Iterator[tuple[str, types.Message]]:
     """Raw, true, clean and world messages of a stream in the order in which they would arrive.
 
     From 2 s to 4 s of every 6 s the left arm is hidden, and at 5 s of every 10 s comes half a second of nonsense.
@@ -94,11 +83,11 @@ def messages(
             if arm_hidden:
                 lost = table.to_canonical[hidden].any(axis=0)
                 joints[lost], confidence[lost] = np.nan, 0.0
-            raw_bodies.append(RawBody(body, to_camera(joints), confidence))
+            raw_bodies.append(types.RawBody(body, to_camera(joints), confidence))
             raw_of[frame, body] = joints, confidence
-            true_bodies.append(_world(body, positions, rotations, velocity, np.full(22, JointState.SEEN), 0.0))
-        yield POSE_RAW, PoseRaw(stamp, "camera", "made-up", skeleton, CAMERA, True, raw_bodies)
-        yield POSE_TRUTH, PoseWorld(stamp, "world", "made-up", np.array([0, 0, 1.0, 0]), true_bodies)
+            true_bodies.append(_world(body, positions, rotations, velocity, np.full(22, types.JointState.SEEN), 0.0))
+        yield POSE_RAW, types.PoseRaw(stamp, "camera", "made-up", skeleton, CAMERA, True, raw_bodies)
+        yield POSE_TRUTH, types.PoseWorld(stamp, "world", "made-up", np.array([0, 0, 1.0, 0]), true_bodies)
         ready = frame - delay_frames
         if ready < 0:
             continue
@@ -108,30 +97,35 @@ def messages(
         clean_bodies, world_bodies = [], []
         for body in range(bodies):
             positions, rotations, velocity = walker(time, body * np.pi)
-            state = np.where(table.observable, JointState.REFINED, JointState.IMPUTED)
-            state[[J["pelvis"], J["left_hip"], J["right_hip"]]] = JointState.SEEN
+            state = np.where(table.observable, types.JointState.REFINED, types.JointState.IMPUTED)
+            state[[J["pelvis"], J["left_hip"], J["right_hip"]]] = types.JointState.SEEN
             if arm_hidden:
-                state[hidden] = JointState.IMPUTED
-            sigma = np.where(state == JointState.IMPUTED, 0.06, 0.012)
+                state[hidden] = types.JointState.IMPUTED
+            sigma = np.where(state == types.JointState.IMPUTED, 0.06, 0.012)
             positions = positions + noise.normal(0, 0.003, positions.shape)
             canonical, trust = to_canonical(table, *raw_of.pop((ready, body)))
             anomaly = float(noise.gamma(2.0, 0.15) + 3.0 * nonsense)
             clean_bodies.append(
-                CleanBody(
+                types.CleanBody(
                     body, to_camera(positions), rotations, state, sigma, anomaly,
                     nonsense, np.full(22, anomaly), np.linalg.norm(REST_OFFSETS, axis=1),
                     to_camera(canonical), trust,
                 )
             )  # fmt: skip
             world_bodies.append(_world(body, positions, rotations, velocity, state, 0.06 if arm_hidden else 0.012))
-        yield POSE_CLEAN, PoseClean(stamp, "camera", "made-up", CAMERA, True, delay_frames, clean_bodies)
-        yield POSE_WORLD, PoseWorld(stamp, "world", "made-up", np.array([0, 0, 1.0, 0]), world_bodies)
+        yield POSE_CLEAN, types.PoseClean(stamp, "camera", "made-up", CAMERA, True, delay_frames, clean_bodies)
+        yield POSE_WORLD, types.PoseWorld(stamp, "world", "made-up", np.array([0, 0, 1.0, 0]), world_bodies)
 
 
-def _world(body: int, positions, rotations, velocity, state, sigma: float) -> WorldBody:
-    heights = positions[[J[name] for name in CONTACTS], 2]
+def _world(body: int, positions, rotations, velocity, state, sigma: float) -> types.WorldBody:
+    heights = positions[[J[name] for name in types.CONTACTS], 2]
     contacts = np.clip((0.11 - heights) / 0.05, 0, 1)
-    return WorldBody(
+    return types.WorldBody(
         body, positions[0], rotations[0], velocity, np.eye(6) * 1e-4, positions, rotations,
-        state, np.full(22, sigma), contacts, Tracking.OK,
+        state, np.full(22, sigma), contacts, types.Tracking.OK,
     )  # fmt: skip
+
+
+def messages_on(topic: str, seconds: float, **options: Any) -> list[Any]:
+    """Those of `messages` on one topic."""
+    return [message for on, message in messages(seconds, **options) if on == topic]

@@ -2,6 +2,7 @@ import contextlib
 import dataclasses
 import struct
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,15 +40,12 @@ def test_messages_of_ros_are_what_ros_says_they_are(name: str, store: Stores):
     assert typestore().hash_rihs01(name) == get_typestore(store).hash_rihs01(name)
 
 
-def test_what_is_decoded_owns_its_arrays():
+def test_what_is_decoded_owns_its_arrays_and_what_is_not_contiguous_is_encoded_by_value() -> None:
     payload = bytearray(PAYLOADS[POSE_CLEAN])
     message = decode(POSE_CLEAN, memoryview(payload))
     payload[:] = bytes(len(payload))
     assert message == clean()
     message.bodies[0].positions[0] = 5  # type: ignore[union-attr]
-
-
-def test_arrays_that_are_not_contiguous_are_encoded_by_value():
     message = raw()
     message.bodies[0].positions = np.asfortranarray(message.bodies[0].positions)
     message.bodies[0].confidence = np.ones(64, np.float32)[::2]
@@ -104,52 +102,38 @@ def _length_field(what: str) -> tuple[str, bytes, int]:
     return topic, payload, payload.index(start)
 
 
-def test_joints_without_their_confidence_are_refused():
+def test_what_decodes_and_is_no_message_is_refused():
     message = raw(joints=4)
     message.bodies[0].confidence = np.ones(3, np.float32)
-    with pytest.raises(DecodeError, match=r"RawBody.confidence: expected shape \(4,\), got shape \(3,\)"):
-        decode(POSE_RAW, encode(message))
-
-
-def test_a_stamp_of_too_many_nanoseconds_is_refused():
-    payload = bytearray(PAYLOADS[POSE_RAW])
-    struct.pack_into("<I", payload, 8, 10**9)
-    with pytest.raises(DecodeError, match="nanosec"):
-        decode(POSE_RAW, bytes(payload))
-
-
-def test_a_diagnostic_array_of_two_is_refused():
+    nanoseconds = bytearray(PAYLOADS[POSE_RAW])
+    struct.pack_into("<I", nanoseconds, 8, 10**9)
     store, name = typestore(), wire_type(TOPICS[DIAGNOSTICS])
     array = store.deserialize_cdr(PAYLOADS[DIAGNOSTICS], name)
     array.status *= 2  # type: ignore[attr-defined]
-    with pytest.raises(DecodeError, match="status: expected one, got 2"):
-        decode(DIAGNOSTICS, bytes(store.serialize_cdr(array, name)))
-
-
-def test_an_unknown_topic_is_refused():
-    with pytest.raises(DecodeError, match="unknown topic 'pose/row': expected one of pose/raw"):
-        decode("pose/row", PAYLOADS[POSE_RAW])
+    for topic, payload, said in (
+        (POSE_RAW, encode(message), r"RawBody.confidence: expected shape \(4,\), got shape \(3,\)"),
+        (POSE_RAW, bytes(nanoseconds), "nanosec"),
+        (DIAGNOSTICS, bytes(store.serialize_cdr(array, name)), "status: expected one, got 2"),
+        ("pose/row", PAYLOADS[POSE_RAW], "unknown topic 'pose/row': expected one of pose/raw"),
+    ):
+        with pytest.raises(DecodeError, match=said):
+            decode(topic, payload)
 
 
 @pytest.mark.parametrize("topic", TOPICS)
 def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str):
     """A valid message of a million bytes, of bodies of nothing, would keep a node busy for seconds."""
-    example = EXAMPLES[topic]
+    example: Any = EXAMPLES[topic]
     if isinstance(example, Diagnostics):
-        large = dataclasses.replace(example, values={str(k): "" for k in range(1001)})
-        fits = dataclasses.replace(example, values={str(k): "" for k in range(1000)})
+        fits, large = (dataclasses.replace(example, values={str(k): "" for k in range(n)}) for n in (1000, 1001))
     elif isinstance(example, PoseEvents):
-        large = dataclasses.replace(example, events=example.events[:1] * 2049)
-        fits = dataclasses.replace(example, events=example.events[:1] * 2048)
+        fits, large = (dataclasses.replace(example, events=example.events[:1] * n) for n in (2048, 2049))
     else:
-        large = dataclasses.replace(example, bodies=example.bodies[:1] * 129)
-        fits = dataclasses.replace(example, bodies=example.bodies[:1] * 128)
+        fits, large = (dataclasses.replace(example, bodies=example.bodies[:1] * n) for n in (128, 129))
     assert decode(topic, encode(fits)) == fits
-    with pytest.raises(DecodeError, match="expected at most"):
-        decode(topic, encode(large))
-    # no more than counted is looked at
-    with pytest.raises(DecodeError, match="expected at most"):
-        decode(topic, encode(large)[:300])
+    for payload in (encode(large), encode(large)[:300]):  # no more than counted is looked at
+        with pytest.raises(DecodeError, match="expected at most"):
+            decode(topic, payload)
 
 
 ORIENTATION = np.array([0.1, -0.2, 0.3, 0.9])

@@ -92,8 +92,11 @@ def test_who_never_reads_is_named_and_waited_for_no_longer_than_a_while(monkeypa
     monkeypatch.setattr(delivery.time, "monotonic", lambda: now[0])
     deliveries = delivery.Deliveries({"reader"}, {})
     deliveries.join(delivery.Listener("reader", 1, (POSE_RAW,)))
+    now[0] += 3600.0
+    assert not deliveries.silent(2.0), "it had nothing to read"
     for _ in range(WINDOW):
         deliveries.sent(POSE_RAW, b"")
+        assert not deliveries.silent(2.0), "it had no time yet"
     now[0] += delivery.DEAF_S
     assert deliveries.waited_for(POSE_RAW) == {"reader"}
     assert deliveries.silent(2.0) == {"reader"}
@@ -105,17 +108,6 @@ def test_who_never_reads_is_named_and_waited_for_no_longer_than_a_while(monkeypa
     deliveries.take(delivery.Taken(1, 0, 200, POSE_RAW))
     assert not deliveries.silent(2.0)
     assert not deliveries.is_taken(POSE_RAW, 200), "who reads again is waited for again"
-
-
-def test_who_has_nothing_to_read_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr(delivery.time, "monotonic", lambda: now[0])
-    deliveries = delivery.Deliveries({"reader"}, {})
-    deliveries.join(delivery.Listener("reader", 1, (POSE_RAW,)))
-    now[0] += 3600.0
-    assert not deliveries.silent(2.0)
-    deliveries.sent(POSE_RAW, b"")
-    assert not deliveries.silent(2.0), "it had no time yet"
 
 
 def test_a_second_one_of_a_name_takes_nothing_away_from_the_first() -> None:

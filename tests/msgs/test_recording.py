@@ -99,23 +99,18 @@ def test_the_same_messages_make_the_same_bytes(whole: Path, tmp_path: Path):
     assert mcap_of(again).read_bytes() == mcap_of(whole).read_bytes()
 
 
-def test_topics_can_be_chosen(whole: Path):
-    with RecordingReader(whole) as reader:
-        chosen = list(reader.messages([POSE_CLEAN, DIAGNOSTICS]))
-        with pytest.raises(ValueError, match=r"expected of pose/raw, .*, got pose/row"):
-            next(reader.messages(["pose/row"]))
-    assert {recorded.topic for recorded in chosen} == {POSE_CLEAN, DIAGNOSTICS}
-    assert len(chosen) == 86 + 3
-
-
 @pytest.mark.parametrize("frame", [0, 1, 15, 16, 44, 89])
-def test_seek(whole: Path, frame: int):
-    start = START_NS + frame * FRAME_NS
+def test_seek_and_topics_can_be_chosen(whole: Path, frame: int):
+    start, chosen = START_NS + frame * FRAME_NS, {POSE_CLEAN, DIAGNOSTICS}
     with RecordingReader(whole) as reader:
         found = list(reader.messages(start_ns=start))
         assert found == [recorded for recorded in reader if recorded.stamp_ns >= start]
         assert found[0].stamp_ns == start
         assert list(reader.messages(start_ns=reader.end_ns + 1)) == []
+        some = list(reader.messages(chosen, start_ns=start))
+        assert some == [recorded for recorded in found if recorded.topic in chosen]
+        with pytest.raises(ValueError, match=r"expected of pose/raw, .*, got pose/row"):
+            next(reader.messages(["pose/row"]))
 
 
 def test_rosbags_reads_it(whole: Path):
@@ -195,53 +190,41 @@ def test_where_there_is_no_recording_it_is_said(content: bytes | None, tmp_path:
     if content is not None:
         (tmp_path / "bag.mcap").write_bytes(content)
         said = r"is not an MCAP file|holds no message"
-    for path in (tmp_path, tmp_path / "bag.mcap"):
-        with pytest.raises(RecordingError, match=said):
+    record(tmp_path / "empty" / "bag", [])
+    for path, why in (
+        (tmp_path, said),
+        (tmp_path / "bag.mcap", said),
+        (tmp_path / "empty" / "bag", "no message on any"),
+    ):
+        with pytest.raises(RecordingError, match=why):
             RecordingReader(path)
-
-
-def test_an_empty_recording_is_refused(tmp_path: Path):
-    record(tmp_path / "empty", [])
-    with pytest.raises(RecordingError, match="holds no message on any of pose/raw, "):
-        RecordingReader(tmp_path / "empty")
-    with AnyReader([tmp_path / "empty"]) as bag:
+    with AnyReader([tmp_path / "empty" / "bag"]) as bag:
         assert bag.message_count == 0
 
 
-def test_a_recording_is_not_overwritten(whole: Path):
-    before = mcap_of(whole).read_bytes()
-    with pytest.raises(RecordingError, match=r"cannot record to .*: File exists; expected a new name"):
-        RecordingWriter(whole)
-    assert mcap_of(whole).read_bytes() == before
-
-
-def test_what_is_written_is_checked(tmp_path: Path):
+def test_what_is_written_is_checked_and_not_overwritten(tmp_path: Path):
     with RecordingWriter(tmp_path / "recording") as writer:
         with pytest.raises(ValueError, match="pose/clean: expected PoseClean, got PoseRaw"):
             writer.write(POSE_CLEAN, raw(), 0)
         with pytest.raises(ValueError, match="stamp_ns: expected 0 or more, got -1"):
             writer.write(POSE_RAW, raw(), -1)
         writer.write(POSE_RAW, raw(), 7)
+    with pytest.raises(RecordingError, match=r"cannot record to .*: File exists; expected a new name"):
+        RecordingWriter(tmp_path / "recording")
     assert read(tmp_path / "recording") == [(POSE_RAW, 7, raw())]
 
 
 def foreign(
-    path: Path,
-    definition: str,
-    *,
-    name: str = "steadypose_msgs/msg/PoseRaw",
-    topic: str = "/pose/raw",
-    encoding: str = "cdr",
-    payload: bytes | None = None,
-    compression: CompressionType = CompressionType.NONE,
-) -> Path:
-    """A recording of one message made by somebody else."""
-    writer = Writer(str(path), compression=compression)
+    path: Path, definition: str, name="steadypose_msgs/msg/PoseRaw", topic="/pose/raw", encoding="cdr",
+    payload: bytes | None = None, compression=CompressionType.NONE, stamps=(5, 5), **options: Any,
+) -> Path:  # fmt: skip
+    """A recording of two messages made by somebody else."""
+    writer = Writer(str(path), compression=compression, **options)
     writer.start("ros2", "somebody")
     schema = writer.register_schema(name, "ros2msg", definition.encode())
     channel = writer.register_channel(topic, encoding, schema)
-    for _ in range(2):
-        writer.add_message(channel, 5, encode(raw()) if payload is None else payload, 5)
+    for stamp in stamps:
+        writer.add_message(channel, stamp, encode(raw()) if payload is None else payload, stamp)
     writer.finish()
     return path
 
@@ -257,27 +240,26 @@ def ros_definition() -> str:
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
-def test_a_recording_made_by_ros_is_read(compression: CompressionType, tmp_path: Path):
-    path = foreign(tmp_path / "ros.mcap", ros_definition(), compression=compression)
-    assert read(path) == [(POSE_RAW, 5, raw())] * 2
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_a_recording_made_by_ros_is_read(compression: CompressionType, use_chunking: bool, tmp_path: Path):
+    how: Any = {"compression": compression, "use_chunking": use_chunking}
+    path = foreign(tmp_path / "ros.mcap", ros_definition(), stamps=(7, 5), **how)
+    assert read(path) == [(POSE_RAW, stamp, raw()) for stamp in (5, 7)]
 
 
-def test_other_definitions_of_our_types_are_refused(tmp_path: Path):
+def test_other_definitions_of_our_types_are_refused_and_topics_of_others_are_passed_over(whole: Path, tmp_path: Path):
+    text: Any = {"definition": "string data", "name": "std_msgs/msg/String"}
     other = ros_definition().replace("float32[] confidence", "float64[] confidence")
-    with pytest.raises(RecordingError, match="another definition of steadypose_msgs/msg/PoseRaw"):
-        RecordingReader(foreign(tmp_path / "other.mcap", other))
-    with pytest.raises(RecordingError, match="cannot read the definition"):
-        RecordingReader(foreign(tmp_path / "broken.mcap", "float32 !"))
-    with pytest.raises(RecordingError, match=r"expected .*PoseRaw as cdr on pose/raw, got std_msgs/msg/String as cdr"):
-        RecordingReader(foreign(tmp_path / "string.mcap", "string data", name="std_msgs/msg/String"))
-    with pytest.raises(RecordingError, match="got steadypose_msgs/msg/PoseRaw as json"):
-        RecordingReader(foreign(tmp_path / "json.mcap", ros_definition(), encoding="json"))
-
-
-def test_topics_of_others_are_passed_over(whole: Path, tmp_path: Path):
-    camera = foreign(tmp_path / "camera.mcap", "string data", name="std_msgs/msg/String", topic="/camera")
-    with pytest.raises(RecordingError, match="holds no message on any of"):
-        RecordingReader(camera)
+    wrong: Any
+    for wrong, said in (
+        ({"definition": other}, "another definition of steadypose_msgs/msg/PoseRaw"),
+        ({"definition": "float32 !"}, "cannot read the definition"),
+        (text, r"expected .*PoseRaw as cdr on pose/raw, got std_msgs/msg/String as cdr"),
+        ({"definition": ros_definition(), "encoding": "json"}, "got steadypose_msgs/msg/PoseRaw as json"),
+        (text | {"topic": "/camera"}, "holds no message on any of"),
+    ):
+        with pytest.raises(RecordingError, match=said):
+            RecordingReader(foreign(tmp_path / "camera.mcap", **wrong))
     (tmp_path / "whole.mcap").write_bytes(mcap_of(whole).read_bytes())
     assert read(tmp_path) == read(whole)
 
@@ -384,18 +366,6 @@ def test_damage_to_compressed_chunks_is_counted(compression: CompressionType, tm
     with RecordingReader(path) as reader:
         assert list(reader) == []
         assert reader.gaps == 1
-
-
-def test_messages_outside_of_chunks_are_read(tmp_path: Path):
-    writer = Writer(str(tmp_path / "plain.mcap"), use_chunking=False)
-    writer.start("ros2", "somebody")
-    channel = writer.register_channel(
-        "/pose/raw", "cdr", writer.register_schema(wire_type(TOPICS[POSE_RAW]), "ros2msg", ros_definition().encode())
-    )
-    for stamp in (7, 5):
-        writer.add_message(channel, stamp, encode(raw()), stamp)
-    writer.finish()
-    assert [recorded.stamp_ns for recorded in read(tmp_path / "plain.mcap")] == [5, 7]
 
 
 def test_a_recording_goes_on_in_the_next_part(tmp_path: Path):

@@ -73,15 +73,11 @@ def test_nan_equals_nan_and_nothing_else():
 def test_from_up_turns_about_x_and_brings_the_axis_to_the_worlds_z(up: str, axis: list[int]):
     pose = Pose.from_up(up)
     turn = Rotation.from_quat(pose.orientation)
-    np.testing.assert_allclose(turn.apply(axis), [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(turn.apply([1, 0, 0]), [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(turn.apply([axis, [1, 0, 0]]), [[0, 0, 1], [1, 0, 0]], atol=1e-12)
     assert not pose.position.any()
-
-
-@pytest.mark.parametrize("up", ["x", "-z", "Y", ""])
-def test_from_up_refuses_other_axes(up: str):
-    with pytest.raises(ValueError, match=rf"expected one of 'z', 'y', '-y', got '{up}'"):
-        Pose.from_up(up)
+    for other in ("x", "-z", "Y", ""):
+        with pytest.raises(ValueError, match=rf"expected one of 'z', 'y', '-y', got '{other}'"):
+            Pose.from_up(other)
 
 
 def test_the_definitions_name_joints_and_states_alike():

@@ -6,7 +6,7 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,10 +17,11 @@ from tests.helpers.synthetic_poses import walker
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import Pose, PoseClean, PoseRaw, PoseWorld, RawBody
+from steadypose.msgs.types import Message, Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
+from steadypose.nodes.sources.source import LiveSource
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -95,9 +96,10 @@ def walk(frames: int, bodies: int = 1) -> list[PoseRaw]:
     return [raw(i, *(walking(i, body) for body in range(bodies))) for i in range(frames)]
 
 
-def walked(frames: int) -> np.ndarray:
-    """(T, 22, 3) metres, z up: the joints of `walk`."""
-    return np.array([frame.bodies[0].positions for frame in walk(frames)])
+def walked(frames: int, bodies: int = 1) -> np.ndarray:
+    """(T, 22, 3) metres, z up, or of several bodies (T, B, 22, 3): the joints of `walk`."""
+    found = np.array([[body.positions for body in frame.bodies] for frame in walk(frames, bodies)])
+    return found[:, 0] if bodies == 1 else found
 
 
 def write_npz(path: Path, positions: np.ndarray, **more: object) -> Path:
@@ -107,11 +109,31 @@ def write_npz(path: Path, positions: np.ndarray, **more: object) -> Path:
     return path
 
 
-def record(directory: Path, messages: Sequence[PoseRaw | PoseClean], topic: str = POSE_RAW) -> Path:
+def record(directory: Path, messages: Iterable[Message | tuple[str, Message]], topic: str = POSE_RAW) -> Path:
+    """Record messages of one topic, or each with its own."""
     with RecordingWriter(directory) as writer:
-        for message in messages:
-            writer.write(topic, message, message.stamp_ns)
+        for item in messages:
+            of, message = item if isinstance(item, tuple) else (topic, item)
+            writer.write(of, message, message.stamp_ns)
     return directory
+
+
+class Given(LiveSource):
+    """Gives these frames, then none; the first once it may."""
+
+    def __init__(self, *frames: PoseRaw | None, may: Callable[[], bool] = lambda: True) -> None:
+        super().__init__()
+        self._frames, self._may = frames, may
+
+    def frames(self) -> Generator[PoseRaw | None, None, None]:
+        while not self._may():
+            yield None
+        yield from self._frames
+        while True:
+            yield None
+
+    def status(self) -> dict[str, str]:
+        return {}
 
 
 @pytest.fixture
@@ -145,12 +167,12 @@ def listeners(node: Node) -> set[str]:
 
 
 @contextmanager
-def repeated(act: Callable[[], object]) -> Iterator[None]:
+def repeated(act: Callable[[], object], every_s: float = 0.02) -> Iterator[None]:
     """Do something again and again beside the block: publishers do not say when a subscriber has come."""
     over = threading.Event()
 
     def go_on() -> None:
-        while not over.wait(0.02):
+        while not over.wait(every_s):
             act()
 
     thread = threading.Thread(target=go_on, daemon=True)

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.nodes.conftest import walk
+from tests.nodes.conftest import walked
 
 import steadypose
 from steadypose import CONTACTS, JOINTS, JointState, PoseClean, PoseWorld
@@ -21,7 +21,7 @@ NODES = Path(__file__).parents[2] / "nodes"
 @pytest.fixture(scope="module")
 def joints() -> np.ndarray:
     """(T, 2, 22, 3) metres, z up; the second body comes later, and the first hides a wrist for a while."""
-    found = np.array([[body.positions for body in frame.bodies] for frame in walk(FRAMES, bodies=2)])
+    found = walked(FRAMES, bodies=2)
     found[10:20, 0, 20] = np.nan
     found[:12, 1] = np.nan
     return found
@@ -127,20 +127,6 @@ def test_a_layout_of_ones_own(joints: np.ndarray) -> None:
         steadypose.Filter(skeleton=["a", "b"])
 
 
-def test_what_is_probably_wrong_is_warned_of_once(joints: np.ndarray) -> None:
-    cleaner = steadypose.Filter()
-
-    def misuse() -> None:
-        for k in range(40):
-            cleaner(1000 * joints[k % FRAMES, 0], k / 30)
-        cleaner.flush()
-
-    with pytest.warns(steadypose.InputWarning, match="divide by 1000") as caught:
-        misuse()
-    assert [str(warning.message).split(":")[0] for warning in caught].count("unit") == 1
-    assert any("millimetres" in problem for problem in cleaner.problems)
-
-
 def test_a_frame_that_cannot_be_used_leaves_the_stream_as_it_was(joints: np.ndarray, first_alone: list[Poses]) -> None:
     alone = joints[:, 0]
     cleaner = steadypose.Filter(delay=DELAY)
@@ -159,28 +145,24 @@ def test_a_frame_that_cannot_be_used_leaves_the_stream_as_it_was(joints: np.ndar
     np.testing.assert_array_equal(found[-1]["positions"], first_alone[-1]["positions"])
 
 
-def test_a_camera_that_moves_says_where_it_is(joints: np.ndarray) -> None:
-    place = steadypose.Pose(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    cleaner = steadypose.Filter(delay=0, sensor_pose=place)
-    pose = [cleaner(frame, k / 30) for k, frame in enumerate(joints[:20, 0])][-1]
-    assert pose is not None
-    np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
-
-
-def test_a_camera_that_moves_says_so_with_every_frame(joints: np.ndarray) -> None:
+def test_a_camera_that_moves_says_where_it_is_with_every_frame(joints: np.ndarray) -> None:
     """One that came once would go on to count, although the camera is elsewhere by then."""
     place = steadypose.Pose(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    cleaner = steadypose.Filter(delay=0)
-    cleaner(joints[0, 0], 0.0, sensor_pose=place)
+    stands, moves = steadypose.Filter(delay=0, sensor_pose=place), steadypose.Filter(delay=0)
+
+    def away(pose: Poses | None) -> np.ndarray:
+        assert pose is not None
+        return pose.world["head"] - pose.positions["head"]
+
+    found = [away(stands(frame, k / 30)) for k, frame in enumerate(joints[:20, 0])]
+    np.testing.assert_allclose(found[-1], [1, 2, 3], atol=0.15)
+    moves(joints[0, 0], 0.0, sensor_pose=place)
     with pytest.raises(ValueError, match="expected one with every frame"):
-        cleaner(joints[1, 0], 1 / 30)
-    pose = cleaner(joints[1, 0], 1 / 30, sensor_pose=place)
-    assert pose is not None
-    np.testing.assert_allclose(pose.world["head"] - pose.positions["head"], [1, 2, 3], atol=0.15)
-    cleaner.flush()
-    _, pose = cleaner(joints[2, 0], 2 / 30), cleaner(joints[3, 0], 3 / 30)
-    assert pose is not None
-    np.testing.assert_allclose(pose.world["head"], pose.positions["head"], atol=0.15)
+        moves(joints[1, 0], 1 / 30)
+    np.testing.assert_allclose(away(moves(joints[1, 0], 1 / 30, sensor_pose=place)), [1, 2, 3], atol=0.15)
+    moves.flush()
+    moves(joints[2, 0], 2 / 30)
+    np.testing.assert_allclose(away(moves(joints[3, 0], 3 / 30)), [0, 0, 0], atol=0.15)
 
 
 def test_the_library_is_above_all_commands() -> None:

@@ -38,24 +38,19 @@ def test_it_gives_what_the_command_writes(tmp_path: Path) -> None:
     assert given.bodies[0].events == given.events
 
 
-def test_several_bodies() -> None:
-    joints = np.stack([WALK, WALK + [3.0, 0.0, 0.0]], axis=1)
+def test_several_bodies_and_an_axis_of_bodies_that_stays_whoever_is_there() -> None:
+    joints, nobody = np.stack([WALK, WALK + [3.0, 0.0, 0.0]], axis=1), np.full_like(WALK, np.nan)
     joints[:30, 1] = np.nan
-    given = steadypose.clean(joints, fps=30.0)
+    alone, given = steadypose.clean(WALK, fps=30.0), steadypose.clean(joints, fps=30.0)
     assert given["body_id"].tolist() == [0, 1]
-    assert given["positions"].shape == (FRAMES, 2, 22, 3)
-    assert given["joint_anomaly"].shape == (FRAMES, 2, 22)
-    np.testing.assert_array_equal(given["positions"][:, 0], steadypose.clean(joints[:, 0], fps=30.0)["positions"])
+    assert (given["positions"].shape, given["joint_anomaly"].shape) == ((FRAMES, 2, 22, 3), (FRAMES, 2, 22))
+    np.testing.assert_array_equal(given["positions"][:, 0], alone["positions"])
     assert np.isnan(given["positions"][:28, 1]).all()
     assert np.abs(given["positions"][-1, 1, :, 0] - joints[-1, 1, :, 0]).max() < 0.1
-
-
-def test_an_axis_of_bodies_stays_whoever_is_there() -> None:
-    nobody = np.full_like(WALK, np.nan)
     joints = np.stack([nobody, WALK, nobody], axis=1)
     given = steadypose.clean(joints, fps=30.0)
     assert given["body_id"].tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(given["positions"][:, 1], steadypose.clean(WALK, fps=30.0)["positions"])
+    np.testing.assert_array_equal(given["positions"][:, 1], alone["positions"])
     assert np.isnan(given["positions"][:, [0, 2]]).all()
     assert (given["state"][:, [0, 2]] == steadypose.JointState.UNKNOWN).all()
     assert steadypose.clean(WALK[:, None], fps=30.0)["positions"].shape == (FRAMES, 1, 22, 3)
@@ -89,15 +84,14 @@ def test_the_frame_before_somebody_enters_has_nothing_of_them(function: Any) -> 
 
 
 def test_a_mask_of_what_was_seen_is_a_confidence() -> None:
-    joints = walked(20)
-    seen = np.ones((20, 22), bool)
+    seen = np.ones(WALK.shape[:2], bool)
     seen[:, 15] = False
-    by_mask = steadypose.clean(joints, fps=30, confidence=seen)
-    by_number = steadypose.clean(joints, fps=30, confidence=seen.astype(float))
+    by_mask = steadypose.clean(WALK, fps=30, confidence=seen)
+    by_number = steadypose.clean(WALK, fps=30, confidence=seen.astype(float))
     np.testing.assert_array_equal(by_mask.state, by_number.state)
     assert (by_mask.state[:, 15] == steadypose.JointState.IMPUTED).all()
     cleaner = steadypose.Filter(delay=0)
-    live = [cleaner(frame, t / 30, confidence=mask) for t, (frame, mask) in enumerate(zip(joints, seen, strict=True))]
+    live = [cleaner(frame, t / 30, confidence=mask) for t, (frame, mask) in enumerate(zip(WALK, seen, strict=True))]
     assert live[-1] is not None
     assert live[-1].state[15] == steadypose.JointState.IMPUTED
 
@@ -111,8 +105,7 @@ def test_a_single_wrong_stamp_is_dropped_without_a_warning_that_the_stream_start
 
 
 def test_what_is_masked_is_missing() -> None:
-    joints = walked(3)
-    masked = np.ma.masked_array(joints, np.zeros(joints.shape, bool))
+    masked = np.ma.masked_array(WALK, np.zeros(WALK.shape, bool))
     masked[1, J["left_wrist"]] = np.ma.masked
     raws = [message for _, message in source_of(masked, fps=30) if isinstance(message, PoseRaw)]
     assert np.unique(np.argwhere(np.isnan(raws[1].bodies[0].positions))[:, 0]).tolist() == [J["left_wrist"]]
@@ -122,15 +115,12 @@ def test_what_is_masked_is_missing() -> None:
     assert as_array("stamp_ns", np.ma.masked_array([1, 2])).dtype.kind == "i"
 
 
-def test_frames_of_confidence_zero_are_not_missed() -> None:
+def test_frames_of_confidence_zero_are_not_missed_and_arrays_by_name_may_be_lists_and_numbers() -> None:
     sure = np.ones(WALK.shape[:2])
     sure[: 4 * FRAMES // 5] = 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isfinite(steadypose.clean(WALK, fps=30.0, confidence=sure)["positions"][-1]).all()
-
-
-def test_arrays_by_name_may_be_lists_and_numbers() -> None:
     given = steadypose.clean({"positions": WALK.tolist(), "fps": 30.0, "skeleton": "smpl22", "up": "z"})
     np.testing.assert_array_equal(given["positions"], steadypose.clean(WALK, fps=30.0)["positions"])
 
@@ -196,8 +186,7 @@ def test_as_a_table_and_as_a_dataset() -> None:
     assert data["positions"].dims == ("time", "body", "joint", "axis")
     wrist = data["world_positions"].sel(joint="left_wrist", body=1)
     np.testing.assert_array_equal(wrist, poses.world["left_wrist"][:, 1])
-    moment = steadypose.Filter(delay=0)(WALK[0], 0.0)
-    assert moment is not None
+    moment: Any = steadypose.Filter(delay=0)(WALK[0], 0.0)
     assert len(moment.to_pandas()) == 1
     assert moment.to_xarray()["sigma"].dims == ("joint",)
 

@@ -185,13 +185,11 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
     write_npz(tmp_path / ".hidden" / "a.npz", WALK)
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "table.csv").touch()
-    assert [is_folder_of_recordings(path) for path in (one, killed, tmp_path / "loose", tmp_path)] == [
-        False, False, True, True,
-    ]  # fmt: skip
+    paths = (one, killed, tmp_path / "loose", tmp_path)
+    assert [is_folder_of_recordings(path) for path in paths] == [False, False, True, True]
     found = find_recordings(tmp_path)
-    assert [str(path.relative_to(tmp_path)) for path in found] == [
-        "killed", "loose/x.mcap", "loose/y.mcap", "one", "table.csv",
-    ]  # fmt: skip
+    expected = ["killed", "loose/x.mcap", "loose/y.mcap", "one", "table.csv"]
+    assert [str(path.relative_to(tmp_path)) for path in found] == expected
     outputs = [str(job.out) for job in plan(tmp_path, Path("o"))]
     assert outputs == ["o/killed", "o/loose/x", "o/loose/y", "o/one", "o/table.npz"]
 

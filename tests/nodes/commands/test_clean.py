@@ -32,20 +32,11 @@ def load(path: Path) -> dict[str, np.ndarray]:
 def test_npz_to_npz(tmp_path: Path) -> None:
     clean(write_npz(tmp_path / "in.npz", walked(FRAMES)), tmp_path / "out.npz")
     out = load(tmp_path / "out.npz")
-    assert {name: array.shape for name, array in out.items()} == {
-        "stamp_ns": (FRAMES,),
-        "positions": (FRAMES, 22, 3),
-        "rotations": (FRAMES, 22, 4),
-        "state": (FRAMES, 22),
-        "sigma": (FRAMES, 22),
-        "anomaly": (FRAMES,),
-        "joint_anomaly": (FRAMES, 22),
-        "anomaly_flag": (FRAMES,),
-        "contacts": (FRAMES, 8),
-        "root_velocity": (FRAMES, 3),
-        "world_positions": (FRAMES, 22, 3),
-        "joint_names": (22,),
-    }
+    assert {name: array.shape[1:] for name, array in out.items() if name != "joint_names"} == {
+        "stamp_ns": (), "positions": (22, 3), "rotations": (22, 4), "state": (22,), "sigma": (22,), "anomaly": (),
+        "joint_anomaly": (22,), "anomaly_flag": (), "contacts": (8,), "root_velocity": (3,), "world_positions": (22, 3),
+    }  # fmt: skip
+    assert {len(array) for array in out.values()} == {FRAMES, len(out["joint_names"])} == {FRAMES, 22}
     for name in ("positions", "rotations", "sigma", "contacts", "root_velocity", "world_positions"):
         assert np.isfinite(out[name]).all(), f"{name}: both ends are answered too"
     assert (out["state"] != JointState.UNKNOWN).all()
@@ -53,19 +44,16 @@ def test_npz_to_npz(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.norm(out["rotations"], axis=-1), 1.0, atol=1e-5)
 
 
-def test_a_single_frame_is_counted_as_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_single_frame_is_counted_as_one_and_what_was_not_used_is_said(tmp_path: Path, capsys) -> None:
     source = write_npz(tmp_path / "in.npz", walked(1))
     clean(source, tmp_path / "out.npz")
     assert "out.npz: 1 frame, " in capsys.readouterr().err
     info(str(source))
     assert "1 frame," in capsys.readouterr().out
-
-
-def test_what_was_not_used_is_said_in_one_line_of_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     far = walked(30)
     far[3, J["left_wrist"]] += 40.0
     far[20, J["left_wrist"]] += 1.0
-    assert clean(write_npz(tmp_path / "in.npz", far), tmp_path / "out.npz") == 0
+    assert clean(write_npz(tmp_path / "far.npz", far), tmp_path / "near.npz") == 0
     assert "  not used as given: joints too far (1), joints refused (1)\n" in capsys.readouterr().err
 
 
@@ -172,26 +160,18 @@ def test_a_gap_is_not_filled_and_a_body_that_comes_later_is_unknown_before() -> 
     np.testing.assert_array_equal(out["positions"][:, 1, 0, 0], [np.nan] * 4 + [0.75])
     assert out["state"][3, 0].tolist() == out["state"][0, 1].tolist() == [JointState.UNKNOWN] * 22
     assert not out["anomaly_flag"].any()
+    nobody = NpzCollector().arrays(np.array([START_NS, START_NS + 1]))
+    assert nobody["positions"].shape == (2, 22, 3), "still a row for each stamp"
+    assert np.isnan(nobody["positions"]).all()
+    assert "body_id" not in nobody
 
 
-def test_without_any_body_there_is_still_a_row_for_each_stamp() -> None:
-    out = NpzCollector().arrays(np.array([START_NS, START_NS + 1]))
-    assert out["positions"].shape == (2, 22, 3)
-    assert np.isnan(out["positions"]).all()
-    assert "body_id" not in out
-
-
-@pytest.fixture
-def damaged(tmp_path: Path) -> Path:
-    path = record(tmp_path / "in", walk(60))
-    file = next(path.glob("*.mcap"))
+def test_of_a_damaged_recording_what_is_left_is_saved_and_what_is_lost_is_said(tmp_path: Path, capsys) -> None:
+    damaged = record(tmp_path / "in", walk(60))
+    file = next(damaged.glob("*.mcap"))
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
-    return path
-
-
-def test_what_is_left_is_saved_and_what_is_lost_is_said(damaged: Path, tmp_path: Path, capsys) -> None:
     assert repair(damaged, tmp_path / "out") == 1
     assert "bytes in 1 place\n" in capsys.readouterr().out
     with RecordingReader(tmp_path / "out") as recording:
@@ -200,8 +180,5 @@ def test_what_is_left_is_saved_and_what_is_lost_is_said(damaged: Path, tmp_path:
     assert repair(tmp_path / "out", tmp_path / "again") == 0
     assert info(str(damaged)) == 0
     assert "steadypose repair" in capsys.readouterr().out
-
-
-def test_clean_says_so_with_its_exit_status(damaged: Path, tmp_path: Path) -> None:
     assert clean(damaged, tmp_path / "out.npz") == 1
     assert (tmp_path / "out.npz").exists()

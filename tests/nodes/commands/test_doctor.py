@@ -71,15 +71,12 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(monkeypatch, tmp_path: Path) -> None:
+    assert set(command.required()[1]) == set(command.EXTRAS), "every extra is told what for"
     pulled = command.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
     monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
     command.PROJECT.write_text(pulled)
     finding = next(iter(command.check_packages()))
     assert (finding.verdict, finding.found) == (Verdict.BAD, "brandnew not installed, expected >=1")
-
-
-def test_every_extra_is_told_what_for() -> None:
-    assert set(command.required()[1]) == set(command.EXTRAS)
 
 
 def test_an_installed_wheel_is_asked_what_it_requires(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -94,19 +91,16 @@ def test_an_installed_wheel_is_asked_what_it_requires(monkeypatch: pytest.Monkey
     assert "extra ros2" not in verdicts(command.check_packages)
 
 
-def test_another_python_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_python_and_a_busy_processor_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     for version, expected in (((3, 10, 0), Verdict.GOOD), ((3, 13, 1), Verdict.GOOD), ((3, 14, 0), Verdict.BAD)):
-        monkeypatch.setattr(command.sys, "version_info", version)
-        finding = only(command.check_python)
+        with monkeypatch.context() as patch:
+            patch.setattr(command.sys, "version_info", version)
+            finding = only(command.check_python)
         assert (finding.verdict, finding.found) == (expected, ".".join(map(str, version)))
-
-
-def test_a_busy_processor_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks.os, "getloadavg", lambda: (64.0, 0.0, 0.0))
     monkeypatch.setattr(checks.os, "sched_getaffinity", lambda _: {0, 1})
-    assert verdicts(checks.check_processor)["processor"] is Verdict.NOTE
-    monkeypatch.setattr(checks.os, "getloadavg", lambda: (0.2, 0.0, 0.0))
-    assert verdicts(checks.check_processor)["processor"] is Verdict.GOOD
+    for load, expected in ((64.0, Verdict.NOTE), (0.2, Verdict.GOOD)):
+        monkeypatch.setattr(checks.os, "getloadavg", lambda load=load: (load, 0.0, 0.0))
+        assert verdicts(checks.check_processor)["processor"] is expected
 
 
 @pytest.mark.parametrize(

@@ -5,26 +5,18 @@ import bvhio
 import numpy as np
 import pandas
 import pytest
+from conftest import record
 from numpy.typing import NDArray
 from pygltflib import GLTF2
 from scipy.spatial.transform import Rotation
 from tests.helpers.bodies import world_body
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
+from steadypose.nodes.sinks import motion_files
 from steadypose.nodes.sinks.glb import to_glb
-from steadypose.nodes.sinks.motion_files import (
-    Y_UP,
-    BodyMotion,
-    ExportError,
-    read_motion,
-    steady,
-    to_bvh,
-    to_csv,
-    to_trc,
-)
+from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, ExportError, read_motion, steady
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
@@ -64,17 +56,16 @@ def recording(path: Path, motion: BodyMotion) -> Path:
     def body(id: int, frame: int) -> WorldBody:
         return world_body(motion.positions[frame] + [10.0 * id, 0, 0], motion.rotations[frame], id=id)
 
-    with RecordingWriter(path) as writer:
-        for frame in range(FRAMES):
-            bodies = [body(id, frame) for id in (0, 3) if id == 0 or frame > 20]
-            stamp = round(frame * 1e9 / 30)
-            writer.write(POSE_WORLD, PoseWorld(stamp, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies), stamp)
-    return path
+    stream = []
+    for frame in range(FRAMES):
+        bodies = [body(id, frame) for id in (0, 3) if id == 0 or frame > 20]
+        stream.append(PoseWorld(round(frame * 1e9 / 30), "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies))
+    return record(path, stream, POSE_WORLD)
 
 
 def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotion) -> None:
     path = tmp_path / "take.bvh"
-    path.write_bytes(to_bvh(motion))
+    path.write_bytes(motion_files.to_bvh(motion))
     root = bvhio.readAsHierarchy(str(path))
     expected = 100 * motion.positions @ Y_UP.T
     for frame in (0, 17, FRAMES - 1):
@@ -90,7 +81,7 @@ def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotio
 
 def test_trc_and_csv_are_read_by_pandas(tmp_path: Path, motion: BodyMotion) -> None:
     path = tmp_path / "take.trc"
-    path.write_bytes(to_trc(motion))
+    path.write_bytes(motion_files.to_trc(motion))
     head = pandas.read_csv(path, sep="\t", skiprows=1, nrows=1)
     assert head[["DataRate", "NumFrames", "NumMarkers", "Units"]].iloc[0].tolist() == [30, FRAMES, 22, "mm"]
     markers = pandas.read_csv(path, sep="\t", skiprows=3, nrows=1, header=None).iloc[0, 2:].dropna()
@@ -100,7 +91,7 @@ def test_trc_and_csv_are_read_by_pandas(tmp_path: Path, motion: BodyMotion) -> N
     np.testing.assert_allclose(table[:, 2:].reshape(FRAMES, 22, 3), 1000 * motion.positions @ Y_UP.T, atol=1e-3)
 
     path = tmp_path / "take.csv"
-    path.write_bytes(to_csv(motion))
+    path.write_bytes(motion_files.to_csv(motion))
     table = pandas.read_csv(path, comment="#")
     np.testing.assert_allclose(table["stamp"], motion.start_s + np.arange(FRAMES) / 30, atol=1e-6)
     for k, joint in enumerate(JOINTS):
@@ -160,9 +151,12 @@ def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, mot
 
 @pytest.mark.parametrize("angles", [[1.5, 0.2, -2.0], np.outer(np.arange(FRAMES), [0.01, 0.0, 0.02])])
 def test_an_npz_of_a_turned_sensor_is_exported_in_the_world(tmp_path: Path, motion: BodyMotion, angles: Floats) -> None:
-    found = read_motion(npz(tmp_path / "clean.npz", motion, Rotation.from_euler("xyz", angles)))
+    path = npz(tmp_path / "clean.npz", motion, Rotation.from_euler("xyz", angles))
+    found = read_motion(path, 0)  # as `info` calls its one body
     assert found.fps == pytest.approx(30.0)
     np.testing.assert_allclose(found.positions, motion.positions, atol=1e-6)
+    with pytest.raises(ExportError, match="no body 7 to export; bodies in it: 0"):
+        read_motion(path, 7)
 
 
 def test_of_a_recording_the_body_that_is_there_longest_or_was_asked_for(tmp_path: Path, motion: BodyMotion) -> None:
@@ -170,13 +164,6 @@ def test_of_a_recording_the_body_that_is_there_longest_or_was_asked_for(tmp_path
     np.testing.assert_allclose(read_motion(path).positions, motion.positions, atol=1e-5)
     np.testing.assert_allclose(read_motion(path, 3).positions[:, 0, 0], motion.root[21:, 0] + 30.0, atol=1e-5)
     assert main(["export", str(path), str(tmp_path / "x.bvh"), "--body", "7"]) != 0
-
-
-def test_of_an_npz_of_one_body_another_id_is_refused(tmp_path: Path, motion: BodyMotion) -> None:
-    path = npz(tmp_path / "clean.npz", motion)
-    assert len(read_motion(path, 0).root) == FRAMES, "`info` calls it 0"
-    with pytest.raises(ExportError, match="no body 7 to export; bodies in it: 0"):
-        read_motion(path, 7)
 
 
 def test_a_gap_is_filled_and_the_rate_kept(tmp_path: Path, motion: BodyMotion) -> None:
@@ -210,13 +197,26 @@ def test_a_body_is_placed_by_all_its_joints(motion: BodyMotion) -> None:
     np.testing.assert_allclose(found.positions, motion.positions, atol=0.05 / 22 + 1e-6)
 
 
-def test_stamps_that_decrease_are_refused_with_what_to_do(tmp_path: Path, motion: BodyMotion, capsys) -> None:
-    path = npz(tmp_path / "clean.npz", motion, backwards=True)
-    assert main(["export", str(path), str(tmp_path / "x.bvh")]) == 2
-    assert (
-        "expected increasing stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"
-        in capsys.readouterr().err
-    )
+@pytest.mark.parametrize(
+    ("source", "out", "more", "said"),
+    [
+        ("clean.npz", "there.glb", [], "--force"),
+        ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
+        ("raw.npz", "take.bvh", [], "clean it first"),
+        ("clean.npz", "take.csv", ["--names", "vrm"], "expected OUT to end in .bvh or .glb, got .csv"),
+        ("back.npz", "take.bvh", [], "stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"),
+    ],
+)
+def test_what_cannot_be_written_is_said(
+    source: str, out: str, more: list[str], said: str, tmp_path: Path, motion: BodyMotion, capsys
+) -> None:
+    npz(tmp_path / "clean.npz", motion)
+    npz(tmp_path / "back.npz", motion, backwards=True)
+    np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
+    (tmp_path / "there.glb").touch()
+    assert main(["export", str(tmp_path / source), str(tmp_path / out), *more]) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["back.npz", "clean.npz", "raw.npz", "there.glb"]
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".trc"])
@@ -229,26 +229,6 @@ def test_tables_come_back_as_they_went(tmp_path: Path, motion: BodyMotion, suffi
     expected = motion.positions if suffix == ".csv" else motion.positions[..., [1, 0, 2]] * [1, -1, 1]
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert frames[-1].stamp_ns == pytest.approx((FRAMES - 1) / 30 * 1e9, abs=1e6)
-
-
-@pytest.mark.parametrize(
-    ("source", "out", "more", "said"),
-    [
-        ("clean.npz", "there.glb", [], "--force"),
-        ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
-        ("raw.npz", "take.bvh", [], "clean it first"),
-        ("clean.npz", "take.csv", ["--names", "vrm"], "expected OUT to end in .bvh or .glb, got .csv"),
-    ],
-)
-def test_what_cannot_be_written_is_said(
-    source: str, out: str, more: list[str], said: str, tmp_path: Path, motion: BodyMotion, capsys
-) -> None:
-    npz(tmp_path / "clean.npz", motion)
-    np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
-    (tmp_path / "there.glb").touch()
-    assert main(["export", str(tmp_path / source), str(tmp_path / out), *more]) == 2
-    assert said in capsys.readouterr().err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["clean.npz", "raw.npz", "there.glb"]
 
 
 def test_a_vrm_animation_rests_in_a_t_and_names_its_humanoid(tmp_path: Path, motion: BodyMotion) -> None:

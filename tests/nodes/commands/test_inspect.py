@@ -1,19 +1,18 @@
 import itertools
 import re
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import record, walk
+from conftest import record, repeated, walk
 from ruamel.yaml import YAML
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages, messages_on
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import CleanBody, Diagnostics, Level, PoseClean, PoseRaw
+from steadypose.msgs.types import CleanBody, Diagnostics, Level
 from steadypose.nodes.commands import info as info_module
 from steadypose.nodes.commands.info import info
 from steadypose.nodes.commands.inspect import Rate, echo, hz, measure
@@ -25,29 +24,19 @@ DEADLINE_S = 20.0
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(1.0, bodies=2):
-            writer.write(topic, message, message.stamp_ns)
-        report = Diagnostics(2 * 10**9, "prior", Level.WARN, "1 dropped or refused", {"queue": "2"})
-        writer.write(DIAGNOSTICS, report, report.stamp_ns)
-    return tmp_path / "bag"
+    report = Diagnostics(2 * 10**9, "prior", Level.WARN, "1 dropped or refused", {"queue": "2"})
+    return record(tmp_path / "bag", [*messages(1.0, bodies=2), (DIAGNOSTICS, report)])
 
 
 def published(endpoint: str, command: Callable[[], object]) -> object:
     """Run a command in a thread while poses are published at ``endpoint``, until it ends; what it returns."""
-    results: list[object] = []
-    stream = list(messages(0.5))
-    thread = threading.Thread(target=lambda: results.append(command()), daemon=True)
-    with Publisher(endpoint) as publisher:
-        thread.start()
-        for turn, (topic, message) in enumerate(itertools.cycle(stream)):
-            assert turn < DEADLINE_S * 1000, "the command did not end"
-            publisher.publish(topic, message)
-            thread.join(0.001)
-            if not thread.is_alive():
-                break
-    (result,) = results
-    return result
+    stream = itertools.cycle(messages(0.5))
+    with (
+        Publisher(endpoint) as publisher,
+        ThreadPoolExecutor(1) as thread,
+        repeated(lambda: publisher.publish(*next(stream)), every_s=0.001),
+    ):
+        return thread.submit(command).result(DEADLINE_S)
 
 
 def test_echo_gives_a_line_a_message_and_a_line_a_body(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,6 +47,8 @@ def test_echo_gives_a_line_a_message_and_a_line_a_body(recording: Path, capsys: 
     assert lines[3].startswith("pose/clean  1.000  made-up  delay 4  2 bodies")
     assert "3 seen, 18 refined, 1 imputed; sigma up to 6.0 cm; anomaly" in lines[4]
     assert len(lines) == 9
+    hz(str(recording), topics=(POSE_RAW,))
+    assert "average rate: 30.000 Hz  min: 0.0333 s  max: 0.0333 s" in capsys.readouterr().out
 
 
 def test_echo_tells_of_the_world_of_nodes_and_of_a_body_that_is_not_seen(
@@ -67,11 +58,9 @@ def test_echo_tells_of_the_world_of_nodes_and_of_a_body_that_is_not_seen(
     out = capsys.readouterr().out
     assert "0.50 m/s, ok" in out
     assert out.splitlines()[-1] == "diagnostics 2.000  prior: WARN 1 dropped or refused"
-    with RecordingWriter(tmp_path / "hidden") as writer:
-        message = next(m for _, m in messages(0.1) if isinstance(m, PoseRaw))
-        message.bodies[0].positions[:] = np.nan
-        writer.write(POSE_RAW, message, message.stamp_ns)
-    echo(str(tmp_path / "hidden"))
+    message = messages_on(POSE_RAW, 0.1)[0]
+    message.bodies[0].positions[:] = np.nan
+    echo(str(record(tmp_path / "hidden", [message])))
     assert "0 of 32 joints" in capsys.readouterr().out
 
 
@@ -79,7 +68,7 @@ def test_echo_in_full_is_yaml_with_every_field(recording: Path, capsys: pytest.C
     echo(str(recording), count=1, full=True, topics=(POSE_CLEAN,))
     echo(str(recording), count=1, full=True, topics=(DIAGNOSTICS,))
     clean, report = YAML(typ="safe").load_all(capsys.readouterr().out)
-    expected = next(m for _, m in messages(1.0, bodies=2) if isinstance(m, PoseClean))
+    expected = messages_on(POSE_CLEAN, 1.0, bodies=2)[0]
     assert clean["stamp_ns"] == expected.stamp_ns
     assert clean["sensor_pose"]["orientation"] == pytest.approx(expected.sensor_pose.orientation, rel=1e-4)
     body = clean["bodies"][1]
@@ -90,18 +79,15 @@ def test_echo_in_full_is_yaml_with_every_field(recording: Path, capsys: pytest.C
     assert report["values"] == {"queue": "2"}
 
 
-def test_echo_of_a_topic_counts_to_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And finds the topic through a launch file."""
-    launch = tmp_path / "here.toml"
+def test_echo_and_hz_of_a_topic_end_after_their_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And find the topic through a launch file, or at its endpoint."""
+    launch, endpoint = tmp_path / "here.toml", f"ipc://{tmp_path}/prior"
     launch.write_text(f'[transport]\ndirectory = "{tmp_path}"\n')
-    published(f"ipc://{tmp_path}/prior", lambda: echo(POSE_CLEAN, count=2, launch=str(launch)))
+    published(endpoint, lambda: echo(POSE_CLEAN, count=2, launch=str(launch)))
     headings = [line for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
     assert [heading[:10] for heading in headings] == ["pose/clean"] * 2
-
-
-def test_hz_of_a_recording_is_that_of_its_stamps(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    hz(str(recording), topics=(POSE_RAW,))
-    assert "average rate: 30.000 Hz  min: 0.0333 s  max: 0.0333 s" in capsys.readouterr().out
+    published(endpoint, lambda: hz(POSE_RAW, count=10, endpoints=(endpoint,)))
+    assert "window: 10" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_the_end_of_a_stream_is_no_frame_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,27 +102,15 @@ def test_the_end_of_a_stream_is_no_frame_of_it(tmp_path: Path, capsys: pytest.Ca
     assert "pose/raw: average rate: 30.000 Hz" in said
 
 
-def test_hz_of_a_topic_ends_after_its_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    endpoint = f"ipc://{tmp_path}/input"
-    published(endpoint, lambda: hz(POSE_RAW, count=10, endpoints=(endpoint,)))
-    assert "window: 10" in capsys.readouterr().out.splitlines()[-1]
-
-
-def test_rate_of_uneven_times() -> None:
+def test_rates_of_uneven_times_are_told_once_a_second_and_look_back_no_further_than_the_window() -> None:
     rate = Rate([0.0, 0.1, 0.2, 0.5])
-    assert rate.mean_hz == pytest.approx(6.0)
-    assert (rate.shortest_s, rate.longest_s) == (pytest.approx(0.1), pytest.approx(0.3))
-    assert rate.deviation_s == pytest.approx(np.std([0.1, 0.1, 0.3]))
+    found = (rate.mean_hz, rate.shortest_s, rate.longest_s, rate.deviation_s)
+    assert found == pytest.approx((6.0, 0.1, 0.3, np.std([0.1, 0.1, 0.3])))
     assert np.isnan(Rate([1.0]).mean_hz)
     assert not Rate([1.0, 1.0]).brief, "a frame and the end of its stream"
-
-
-def test_measuring_tells_once_a_second_and_looks_back_no_further_than_the_window() -> None:
-    slow_then_fast = [*np.arange(0, 10, 0.1), *np.arange(10, 20, 0.05)]
-    rates = list(measure(iter(slow_then_fast), window_s=2.0))
+    rates = list(measure(iter([*np.arange(0, 10, 0.1), *np.arange(10, 20, 0.05)]), window_s=2.0))
     assert len(rates) == pytest.approx(20, abs=1)
-    assert rates[5].mean_hz == pytest.approx(10.0, rel=0.01)
-    assert rates[-1].mean_hz == pytest.approx(20.0, rel=0.01)
+    assert (rates[5].mean_hz, rates[-1].mean_hz) == pytest.approx((10.0, 20.0), rel=0.01)
     assert rates[-1].count == pytest.approx(41, abs=1)
 
 

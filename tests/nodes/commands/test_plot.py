@@ -2,16 +2,17 @@ import dataclasses
 import errno
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from conftest import record as record_of
+from conftest import record
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
-from tests.helpers.synthetic_poses import START_NS, messages
+from tests.helpers.rendered_board import write_video
+from tests.helpers.synthetic_poses import START_NS, messages, messages_on
 
-from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.small import plot
@@ -26,9 +27,11 @@ from steadypose.prior.body.skeleton import J
 GONE = object()
 """Returned for a message that is to go."""
 EVERY = {POSE_RAW, POSE_CLEAN, POSE_WORLD, POSE_TRUTH}
+PARTS = [(30, {POSE_RAW}), (30, {POSE_CLEAN}), (30, {POSE_WORLD, POSE_TRUTH}), (1, {POSE_RAW}), (5, EVERY), (6, EVERY)]
+"""Frames and topics of recordings, also of a frame or two."""
 
 
-def record(
+def recorded(
     directory: Path,
     seconds: float,
     topics: Collection[str] = EVERY,
@@ -36,11 +39,8 @@ def record(
     **options,
 ) -> Path:
     """What is made up, each message changed."""
-    with RecordingWriter(directory) as writer:
-        for topic, message in messages(seconds, **options):
-            if topic in topics and change(topic, message) is not GONE:
-                writer.write(topic, message, message.stamp_ns)
-    return directory
+    stream = (it for it in messages(seconds, **options) if it[0] in topics and change(*it) is not GONE)
+    return record(directory, stream)
 
 
 def drawn(recording: Path) -> bool:
@@ -49,39 +49,28 @@ def drawn(recording: Path) -> bool:
     return picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    "topics",
-    [
-        *(
-            pytest.param(topics, marks=pytest.mark.slow)
-            for topics in ({POSE_RAW}, {POSE_CLEAN}, {POSE_WORLD, POSE_TRUTH})
-        ),
-        EVERY,
-    ],
-    ids=lambda topics: "+".join(sorted(topic.removeprefix("pose/") for topic in topics)),
+    ("frames", "topics"), [(30, EVERY), *(pytest.param(*it, marks=pytest.mark.slow) for it in PARTS)]
 )
-@pytest.mark.filterwarnings("error")
-def test_draws_what_there_is(tmp_path: Path, topics: set[str]) -> None:
-    assert drawn(record(tmp_path / "bag", 1.0, topics))
+def test_draws_what_there_is(tmp_path: Path, frames: int, topics: set[str]) -> None:
+    assert drawn(recorded(tmp_path / "bag", frames / 30, topics))
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("raw", "topics"), [(1, {POSE_RAW}), (5, EVERY), (6, EVERY)])
-def test_draws_a_recording_of_a_frame_or_two(tmp_path: Path, raw: int, topics: set[str]) -> None:
-    assert drawn(record(tmp_path / "bag", raw / 30, topics))
+def hide(_: str, message: Message) -> None:
+    """Of nothing seen, and nothing known of contacts."""
+    if isinstance(message, PoseRaw):
+        message.bodies[0].positions[:] = np.nan
+    if isinstance(message, PoseClean):
+        message.bodies[0].raw_positions[:] = np.nan
+        message.bodies[0].anomaly = np.nan
+    if isinstance(message, PoseWorld):
+        message.bodies[0].contacts[:] = np.nan
 
 
 @pytest.mark.filterwarnings("error")
 def test_draws_frames_in_which_nothing_is_seen(tmp_path: Path) -> None:
-    def hide(_: str, message: Message) -> None:
-        if isinstance(message, PoseRaw):
-            message.bodies[0].positions[:] = np.nan
-        if isinstance(message, PoseClean):
-            message.bodies[0].raw_positions[:] = np.nan
-            message.bodies[0].anomaly = np.nan
-
-    assert drawn(record(tmp_path / "bag", 1.0, change=hide))
+    assert drawn(recorded(tmp_path / "bag", 1.0, change=hide))
 
 
 @pytest.mark.filterwarnings("error")
@@ -89,13 +78,12 @@ def test_draws_frames_in_which_nothing_is_seen(tmp_path: Path) -> None:
 def test_contacts_that_are_unknown_are_drawn_as_such(tmp_path: Path, hidden: bool) -> None:
     """And not those between two parts of a stream."""
 
-    def hide(_: str, message: Message) -> object:
+    def change(_: str, message: Message) -> object:
         if isinstance(message, PoseWorld) and hidden:
             message.bodies[0].contacts[2:6] = np.nan
         return GONE if 2 * 10**9 < message.stamp_ns < 3 * 10**9 else None
 
-    world = history_of_path(record(tmp_path / "bag", 3.0, change=hide)).track(POSE_WORLD, 0)
-    assert world is not None
+    world: Any = history_of_path(recorded(tmp_path / "bag", 3.0, change=change)).track(POSE_WORLD, 0)
     ax = Figure().subplots()
     draw_contacts(ax, world)
     legend = ax.get_legend()
@@ -103,12 +91,9 @@ def test_contacts_that_are_unknown_are_drawn_as_such(tmp_path: Path, hidden: boo
 
 
 def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "bag") as writer:
-        for topic, message in messages(2.0, bodies=2):
-            writer.write(topic, message, message.stamp_ns)
-        values = {"dropped.late": "3", "queue": "1", "refused.undecodable": "2"}
-        writer.write(DIAGNOSTICS, Diagnostics(3 * 10**9, "prior", Level.WARN, "", values), 3 * 10**9)
-    history = history_of_path(tmp_path / "bag")
+    values = {"dropped.late": "3", "queue": "1", "refused.undecodable": "2"}
+    news = (DIAGNOSTICS, Diagnostics(3 * 10**9, "prior", Level.WARN, "", values))
+    history = history_of_path(record(tmp_path / "bag", [*messages(2.0, bodies=2), news]))
     assert history.dropped_or_refused == {"prior dropped.late": 3, "prior refused.undecodable": 2}
     assert set(history.tracks[POSE_CLEAN]) == {0, 1}
     for body in (0, 1):
@@ -117,15 +102,22 @@ def test_reads_bodies_errors_and_troubles(tmp_path: Path) -> None:
         assert errors[POSE_CLEAN].mean.mean() == pytest.approx(0.0048, abs=0.0006)
         assert errors[POSE_WORLD].mean.mean() == pytest.approx(0.0048, abs=0.0006)
         assert np.isnan(errors[POSE_RAW].by_joint[J["spine1"]]), "a joint that the sensor lacks has no error"
+    assert draw(history, 1).get_suptitle().endswith("body 1, one of 2"), "an id is told from a count"
 
 
-def test_a_body_is_compared_with_the_person_who_stands_there(tmp_path: Path) -> None:
+def test_a_body_is_compared_with_the_person_who_stands_there_while_there_is_truth(tmp_path: Path) -> None:
     def renumber(_: str, message: Message) -> None:
         for body in message.bodies if isinstance(message, PoseRaw) else ():
             body.id = 7 - body.id
 
-    history = history_of_path(record(tmp_path / "bag", 1.0, change=renumber, bodies=2))
+    history = history_of_path(recorded(tmp_path / "bag", 1.0, change=renumber, bodies=2))
     assert errors_of(history, 7)[POSE_RAW].mean.max() < 0.1
+
+    def silence(topic: str, message: Message) -> object:
+        return GONE if topic == POSE_TRUTH and 2e9 < message.stamp_ns < 3e9 else None
+
+    times = errors_of(history_of_path(recorded(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
+    assert not ((times > 1.1) & (times < 1.9)).any()
 
 
 def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) -> None:
@@ -134,22 +126,13 @@ def test_a_camera_whose_place_is_unknown_is_put_where_it_fits(tmp_path: Path) ->
             turned = Rotation.from_euler("z", 50, degrees=True) * Rotation.from_quat(message.sensor_pose.orientation)
             message.calibrated, message.sensor_pose = False, Pose(np.array([5.0, 6.0, 7.0]), turned.as_quat())
 
-    errors = errors_of(history_of_path(record(tmp_path / "bag", 3.0, change=misplace)), 0)
+    errors = errors_of(history_of_path(recorded(tmp_path / "bag", 3.0, change=misplace)), 0)
     assert errors[POSE_RAW].mean.mean() == pytest.approx(0.032, abs=0.004)
 
 
-def test_no_error_where_the_truth_is_silent(tmp_path: Path) -> None:
-    def silence(topic: str, message: Message) -> object:
-        return GONE if topic == POSE_TRUTH and 2e9 < message.stamp_ns < 3e9 else None
-
-    times = errors_of(history_of_path(record(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
-    assert not ((times > 1.1) & (times < 1.9)).any()
-
-
 def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
-    history = history_of_path(record(tmp_path / "bag", 4.0, {POSE_CLEAN}))
-    track = history.track(POSE_CLEAN, 0)
-    assert track is not None
+    history = history_of_path(recorded(tmp_path / "bag", 4.0, {POSE_CLEAN}))
+    track: Any = history.track(POSE_CLEAN, 0)
     assert busiest_joints(track)[0] == J["left_wrist"]
 
 
@@ -163,7 +146,7 @@ def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
-    recording = record(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
+    recording = recorded(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
     with pytest.raises(PlotError, match=expected):
         plot(recording, tmp_path / output, **options)
 
@@ -173,18 +156,13 @@ def test_a_full_disk_is_said_and_the_picture_that_was_there_stays(tmp_path: Path
         path.write_bytes(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    recording, picture = record(tmp_path / "bag", 0.2, {POSE_RAW}), tmp_path / "picture.png"
+    recording, picture = recorded(tmp_path / "bag", 0.2, {POSE_RAW}), tmp_path / "picture.png"
     picture.write_bytes(b"whole")
     monkeypatch.setattr(Figure, "savefig", save_half)
     with pytest.raises(LaunchError, match=r"picture.png: No space left on device; make room"):
         plot(recording, picture)
     assert picture.read_bytes() == b"whole"
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "picture.png"}
-
-
-def test_the_title_tells_an_id_from_a_count(tmp_path: Path) -> None:
-    history = history_of_path(record(tmp_path / "bag", 0.5, bodies=2))
-    assert draw(history, 1).get_suptitle().endswith("body 1, one of 2")
 
 
 def labels(figure: Figure, title: str) -> list[str]:
@@ -195,14 +173,8 @@ def labels(figure: Figure, title: str) -> list[str]:
 
 
 def test_every_line_has_a_label_and_no_label_is_without_a_line(tmp_path: Path) -> None:
-    def hide(_: str, message: Message) -> None:
-        if isinstance(message, PoseClean):
-            message.bodies[0].raw_positions[:] = np.nan
-        if isinstance(message, PoseWorld):
-            message.bodies[0].contacts[:] = np.nan
-
-    whole = draw(history_of_path(record(tmp_path / "whole", 1.0)))
-    bare = draw(history_of_path(record(tmp_path / "bare", 1.0, {POSE_CLEAN, POSE_WORLD}, hide)))
+    whole = draw(history_of_path(recorded(tmp_path / "whole", 1.0)))
+    bare = draw(history_of_path(recorded(tmp_path / "bare", 1.0, {POSE_CLEAN, POSE_WORLD}, hide)))
     path, joint = "pelvis from above, world, m", "left_wrist relative to the pelvis, m"
     assert labels(whole, path)[:3] == ["ground truth", "world", "start"]
     assert "raw" in labels(whole, ""), "the stick figures"
@@ -222,7 +194,7 @@ def test_the_legend_of_a_video_without_states_fits_it(tmp_path: Path, monkeypatc
         return save(iter(images), path, fps)
 
     monkeypatch.setattr(video_of, "_write_gif", measure)
-    plot(record(tmp_path / "bag", 0.3, {POSE_RAW}), video=tmp_path / "raw.gif")
+    plot(recorded(tmp_path / "bag", 0.3, {POSE_RAW}), video=tmp_path / "raw.gif")
     assert wide == [False] * len(wide)
     assert wide
 
@@ -246,7 +218,7 @@ SHOWN = 480 / 640
 @pytest.fixture
 def cleaned() -> list[PoseClean]:
     """Each frame of the video, of one person; what went in is a hand's width to the left of what came out."""
-    found = [message for topic, message in messages(FRAMES / 30 + 0.5) if isinstance(message, PoseClean)]
+    found = messages_on(POSE_CLEAN, FRAMES / 30 + 0.5)
     for message in found:
         message.bodies[0].raw_positions[:] = message.bodies[0].positions - [0.4, 0.0, 0.0]
     return [dataclasses.replace(message, stamp_ns=message.stamp_ns - START_NS) for message in found]
@@ -254,12 +226,7 @@ def cleaned() -> list[PoseClean]:
 
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
-    path = tmp_path / "video.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
-    for _ in range(FRAMES):
-        writer.write(np.full((SIZE[1], SIZE[0], 3), 90, np.uint8))
-    writer.release()
-    return path
+    return write_video(tmp_path / "video.avi", SIZE, [90] * FRAMES)
 
 
 def images(path: Path) -> list[np.ndarray]:
@@ -284,7 +251,7 @@ def pictured(image: np.ndarray, at: np.ndarray) -> bool:
 def test_raw_and_clean_stand_side_by_side_where_the_camera_saw_them(
     tmp_path: Path, cleaned: list[PoseClean], video: Path
 ) -> None:
-    plot(record_of(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
+    plot(record(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     written = images(tmp_path / "out.mp4")
     assert len(written) == FRAMES / 2, "15 a second"
     last = written[-1]
@@ -304,10 +271,10 @@ def test_raw_and_clean_stand_side_by_side_where_the_camera_saw_them(
 def test_what_was_not_observed_is_faint(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     hidden = [J["left_knee"], J["left_ankle"], J["left_foot"]]
     solid = tmp_path / "solid"
-    plot(record_of(solid, cleaned, POSE_CLEAN), video=tmp_path / "solid.mp4", over=video)
+    plot(record(solid, cleaned, POSE_CLEAN), video=tmp_path / "solid.mp4", over=video)
     for message in cleaned:
         message.bodies[0].state[hidden] = JointState.IMPUTED
-    plot(record_of(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "faint.mp4", over=video)
+    plot(record(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "faint.mp4", over=video)
     here = cleaned[0].bodies[0]
     x, y = np.round(pixels(here.positions)[hidden[:2]].mean(axis=0)).astype(int)
     strength = [np.abs(images(tmp_path / f"{name}.mp4")[0][y, 480 + x] - 90).max() for name in ("solid", "faint")]
@@ -330,11 +297,11 @@ def test_arrays_have_clean_alone(tmp_path: Path, cleaned: list[PoseClean], video
 def test_another_video_is_refused(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     later = [dataclasses.replace(message, stamp_ns=message.stamp_ns + 10**10) for message in cleaned]
     with pytest.raises(PlotError, match=r"clean .*video\.avi OUT' makes: .* ends after 0\.7 s, these begin at 10\.0 s"):
-        plot(record_of(tmp_path / "bag", later, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
+        plot(record(tmp_path / "bag", later, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     for message in cleaned:
         message.bodies[0].positions[:] = message.bodies[0].positions[:, [2, 0, 1]] * [1.0, 1.0, -1.0]
     with pytest.raises(PlotError, match="none of these lies within its images"):
-        plot(record_of(tmp_path / "world", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
+        plot(record(tmp_path / "world", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     assert not (tmp_path / "out.mp4").exists()
     with pytest.raises(PlotError, match="over: expected a video that OpenCV can read"):
         plot(tmp_path / "bag", video=tmp_path / "out.mp4", over=tmp_path / "nowhere.mp4")

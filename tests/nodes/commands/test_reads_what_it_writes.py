@@ -84,18 +84,21 @@ def test_arrays_without_what_was_observed_show_no_corrections(cleaned: Path) -> 
     assert "mean distance between raw and clean, cm" not in shown["walk.npz"]
 
 
-def test_info_says_what_is_in_it(cleaned: Path, capsys) -> None:
+def test_info_says_what_is_in_it_and_tells_of_problems_anywhere_in_a_file(cleaned: Path, tmp_path: Path, capsys):
     assert main(["info", str(cleaned / "walk.npz")]) == 0
     told = capsys.readouterr().out
-    assert "an output of clean, complete or fit" in told
-    assert f"world_positions ({FRAMES}, 22, 3) float32" in told
-    assert "imputed" in told
-    assert "skeleton smpl22" in told
+    arrays = f"world_positions ({FRAMES}, 22, 3) float32"
+    for said in ("an output of clean, complete or fit", arrays, "skeleton smpl22", "imputed"):
+        assert said in told
     assert main(["info", str(cleaned / "walk.csv")]) == 0
     of_table = capsys.readouterr().out
     assert f"{FRAMES} frames" in of_table
     assert re.search(r"\d+% of their joints observed", of_table)[0] in told  # type: ignore[index]
     assert "100% of" not in told
+    millimetres = np.full((240, 22, 3), np.nan)
+    millimetres[:60] = 1000 * walked(60)
+    assert main(["info", str(write_npz(tmp_path / "in.npz", millimetres))]) == 0
+    assert "millimetres, expected metres; divide by 1000" in capsys.readouterr().out
 
 
 def test_several_bodies_have_a_row_each(tmp_path: Path) -> None:
@@ -114,10 +117,3 @@ def test_a_view_has_up_above_and_the_bodys_left_on_the_viewers_right() -> None:
     origin, up, left = np.array([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]) @ view
     assert up[1] > origin[1] + 0.9
     assert left[0] > origin[0] + 0.8
-
-
-def test_info_tells_of_problems_anywhere_in_a_file(tmp_path: Path, capsys) -> None:
-    millimetres = np.full((240, 22, 3), np.nan)
-    millimetres[:60] = 1000 * walked(60)
-    assert main(["info", str(write_npz(tmp_path / "in.npz", millimetres))]) == 0
-    assert "millimetres, expected metres; divide by 1000" in capsys.readouterr().out

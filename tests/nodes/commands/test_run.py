@@ -1,5 +1,7 @@
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import SimpleNamespace as Made
 from typing import Any
 
 import pytest
@@ -27,16 +29,14 @@ def said() -> list[str]:
 
 @pytest.fixture
 def start(clock: VirtualClock, said: list[str]) -> Iterator[Start]:
-    children: list[Child] = []
+    with ExitStack() as children:
 
-    def start(code: str) -> Child:
-        child = Child("prior", [sys.executable, "-c", code], clock, said.append)
-        children.append(child)
-        return child
+        def start(code: str) -> Child:
+            child = Child("prior", [sys.executable, "-c", code], clock, said.append)
+            children.callback(child.stop)
+            return child
 
-    yield start
-    for child in children:
-        child.stop()
+        yield start
 
 
 def ended(child: Child) -> None:
@@ -75,14 +75,21 @@ def test_a_node_that_crashes_starts_again_a_little_later_each_time(
     assert said[:2] == [f"prior: ended with status 7; starting it again in {pause} s" for pause in ("0", "0.5")]
 
 
-def test_a_node_that_was_never_heard_has_failed_at_last(start: Start, clock: VirtualClock) -> None:
-    child = start("raise SystemExit(7)")
+def test_a_node_that_was_never_heard_has_failed_at_last_and_one_that_ran_for_a_while_gets_new_chances(
+    start: Start, clock: VirtualClock
+) -> None:
+    child, heard = start("raise SystemExit(7)"), start("raise SystemExit(7)")
     for crashes in range(1, TRIES):
         ended(child)
         assert child.state == ("running" if crashes == 1 else "crashed")
         later(child, clock, BACKOFF_S[-1])
     ended(child)
     assert child.state == "failed"
+    heard.heard()
+    for _ in range(2 * len(BACKOFF_S)):
+        clock.time_ns += round((STEADY_S + 1) * 1e9)
+        ended(heard)
+        assert heard.state == "running", "again, and at once"
 
 
 def test_a_node_that_falls_silent_is_stale_then_killed_and_started_again(
@@ -111,27 +118,11 @@ def test_a_supervisor_that_was_away_blames_nobody(clock: VirtualClock, said: lis
         assert child.state == "running"
 
 
-def test_a_node_that_ran_for_a_while_gets_new_chances(start: Start, clock: VirtualClock) -> None:
-    child = start("raise SystemExit(7)")
-    child.heard()
-    for _ in range(2 * len(BACKOFF_S)):
-        clock.time_ns += round((STEADY_S + 1) * 1e9)
-        ended(child)
-        assert child.state == "running", "again, and at once"
-
-
 class Processes:
     """In a supervisor's place: children that are in whatever state the test says."""
 
-    class _Child:
-        restarts = 0
-        state = "running"
-        reports = True
-
-        def heard(self) -> None: ...
-
     def __init__(self, *names: str) -> None:
-        self.children = {name: self._Child() for name in names}
+        self.children = {n: Made(restarts=0, state="running", reports=True, heard=lambda: None) for n in names}
         self.failed: list[str] = []
 
 
@@ -140,25 +131,23 @@ def news(node: str, ended: str = "", level: Level = Level.OK, **values: str) -> 
     return "diagnostics", Diagnostics(1, node, level, "", {"state": "running", "ended": ended, **named})
 
 
+@pytest.fixture
+def watched(clock: VirtualClock, make_launch: Callable[..., Launch]) -> tuple[_Run, Any]:
+    launch = make_launch(nodes=str(NODES).replace("'", '"'))
+    return _Run(launch, [], Console(quiet=True), clock), Processes(*NODES)
+
+
 NODES = ["pose_input", "prior", "trajectory", "recorder"]
 
 
-@pytest.fixture
-def watched(clock: VirtualClock, make_launch: Callable[..., Launch]) -> tuple[_Run, Supervisor]:
-    launch = make_launch(nodes='["pose_input", "prior", "trajectory", "recorder"]')
-    return _Run(launch, [], Console(quiet=True), clock), Processes(*NODES)  # type: ignore[return-value]
-
-
-def test_a_run_is_over_when_its_end_is_recorded_also_by_a_recorder_that_was_killed(
-    watched: tuple[_Run, Supervisor],
-) -> None:
+def test_a_run_is_over_when_its_end_is_recorded_also_by_a_recorder_that_was_killed(watched: tuple[_Run, Any]) -> None:
     run, processes = watched
     assert run._exit_status(processes) is None
     processes.children["pose_input"].state = "ended"
     for name in NODES:
         assert run._exit_status(processes) is None, f"{name} has not heard it yet"
         run._receive(news(name, f"{POSE_CLEAN} {POSE_RAW} {POSE_WORLD}"), processes)
-    recorder: Any = processes.children["recorder"]
+    recorder = processes.children["recorder"]
     recorder.restarts, recorder.reports = 1, False
     assert run._exit_status(processes) is None, "another one is to complete the file"
     recorder.reports = True
@@ -166,7 +155,7 @@ def test_a_run_is_over_when_its_end_is_recorded_also_by_a_recorder_that_was_kill
     assert run._exit_status(processes) == 0
 
 
-def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Supervisor], clock: VirtualClock) -> None:
+def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Any], clock: VirtualClock) -> None:
     run, processes = watched
     processes.children["pose_input"].state = "ended"
     for _ in range(3):
@@ -178,7 +167,7 @@ def test_a_run_whose_end_got_lost_does_not_wait_forever(watched: tuple[_Run, Sup
     assert run._exit_status(processes) == 1
 
 
-def test_what_was_lost_on_the_way_is_no_success(watched: tuple[_Run, Supervisor]) -> None:
+def test_what_was_lost_on_the_way_is_no_success(watched: tuple[_Run, Any]) -> None:
     run, processes = watched
     for restarts, lost in enumerate("030"):
         processes.children["prior"].restarts = restarts // 2
@@ -189,7 +178,7 @@ def test_what_was_lost_on_the_way_is_no_success(watched: tuple[_Run, Supervisor]
 
 def test_what_another_runs_nodes_say_is_not_believed(clock: VirtualClock, make_launch: Callable[..., Launch]) -> None:
     run = _Run(make_launch(nodes='["prior"]'), [], Console(quiet=True), clock, identity="this")
-    processes: Supervisor = Processes("prior")  # type: ignore[assignment]
+    processes: Any = Processes("prior")
     for identity in ("another", ""):
         topic, said = news("prior")
         said.values[RUN] = identity
@@ -242,7 +231,7 @@ def test_the_table_leaves_out_what_does_not_fit_into_a_terminal() -> None:
 def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
     console = Console(width=140, record=True)
     run = _Run(make_launch(nodes='["prior"]'), [], console, clock)
-    processes: Supervisor = Processes("prior")  # type: ignore[assignment]
+    processes: Any = Processes("prior")
     for _ in range(2):
         run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"), processes)
     assert "stamps_zero" in lines(["prior"], run._diagnostics, processes)[0]

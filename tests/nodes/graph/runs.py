@@ -6,11 +6,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from conftest import until
+import pytest
+from conftest import record, until, walk
 
 from steadypose.nodes.graph.run_state import HEALTH_FILE
 
@@ -63,9 +63,9 @@ class Run:
         self._output.close()
 
 
-@contextmanager
-def runs(folder: Path) -> Iterator[Callable[..., Run]]:
-    """A function that starts a run, which ends with the block at the latest."""
+@pytest.fixture
+def start(folder: Path) -> Iterator[Callable[..., Run]]:
+    """A function that starts a run, which ends with the test at the latest."""
     begun: list[Run] = []
 
     def start(*arguments: str, beside: bool = False) -> Run:
@@ -77,8 +77,11 @@ def runs(folder: Path) -> Iterator[Callable[..., Run]]:
         begun.append(Run(where, *arguments))
         return begun[-1]
 
-    try:
-        yield start
-    finally:
-        for run in begun:
-            run.close()
+    yield start
+    for run in begun:
+        run.close()
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return record(tmp_path / "in", walk(90))

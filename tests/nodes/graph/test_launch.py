@@ -2,15 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from steadypose.nodes.graph.launch import (
-    Launch,
-    bundled,
-    check_weights_of,
-    find,
-    full_key,
-    in_launch_file,
-    pipeline_sections,
-)
+from steadypose.nodes.graph import launch as module
+from steadypose.nodes.graph.launch import Launch, bundled, check_weights_of, find, in_launch_file
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import InputSettings, open_input
@@ -28,17 +21,14 @@ def write(tmp_path: Path):
     return write
 
 
-def test_an_empty_file_is_a_launch(write) -> None:
+def test_an_empty_file_is_a_launch_and_the_projects_own_are_found_by_name(write) -> None:
     launch = Launch.read(write(""))
     assert launch.nodes == ["pose_input", "prior", "trajectory"]
     assert launch.settings(InputSettings).rate == 1.0
     assert launch.transport.endpoint("prior").startswith("ipc://")
-
-
-@pytest.mark.parametrize("name", ["replay", "kiosk"])
-def test_the_projects_own_files_are_found_by_name(name: str) -> None:
-    launch = Launch.read(name)
-    assert Path(launch.settings(InputSettings).recording).parent.resolve() == bundled("sim_data").resolve()
+    for name in ("replay", "kiosk"):
+        recording = Path(Launch.read(name).settings(InputSettings).recording)
+        assert recording.parent.resolve() == bundled("sim_data").resolve()
 
 
 @pytest.mark.parametrize(
@@ -47,14 +37,12 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[inptu]", "did you mean 'input'"),
         ("[input]\nrecordin = 'x'", "did you mean 'recording'"),
         ("[input]\nrate = 'fast'", "expected float such as 1.0, got 'fast'"),
-        ("[input]\nloop = 1", "loop"),
         ("input = 3", "expected a section"),
         ("nodes = ['priro']", "did you mean 'prior'"),
         ("nodes = ['prior', 'prior']", "nodes names 'prior' 2 times: expected each node once"),
         ("nodes = [['prior']]", r"nodes: expected each to be a text, got \['prior'\]"),
         ("nodes = []", "nodes: expected one or more of pose_input, prior"),
         ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
-        ("[recorder]\ntopics = [['pose/raw']]", r"topics: expected each to be a text, got \['pose/raw'\]"),
         ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
         ("[transport.endpoints]\nprior = 7101", r"\[transport\] endpoints: expected each to be a text, got 7101"),
         (
@@ -66,12 +54,15 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         (f"[input]\nrate = 1{400 * '0'}", "input.rate: expected an integer of at most 64 bits, got one of 1329"),
         (f"[input.calibration]\nsize = [1, 1{400 * '0'}]", "input.calibration.size: expected an integer of at most 64"),
         (f"[input]\nrate = 1{5000 * '0'}", "is not TOML: Exceeds the limit"),
-        ("[input]\nrate = inf", "rate: expected a finite number"),
         ("[input]\nrate = -1.0", r"rate: expected 0 \(as fast as possible\) or more, got -1"),
         ("[input.calibration]\nposition = ['a', 1, 2]", "position: expected each to be a float, got 'a'"),
+        ("[input.calibration]\nposition = [1.0, 2.0]", r"input\.calibration"),
+        ("[input.calibration]\nposition = [1.0, 2.0, 3.0]", r"input\.calibration"),
+        ("[input.calibration]\nposition = [0.0, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 2.0]", r"input\.calibration"),
+        ("[input.calibration]\nposition = [nan, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 1.0]", r"input\.calibration"),
+        ("[input.calibration]\nsize = [640, 360]", r"input\.calibration"),
+        ("[input.calibration]\nsize = [6, 3]\nfocal = [0.0, 5.0]\ncentre = [3.0, 1.0]", r"input\.calibration"),
         ("[input.webcam]\nbodies = 0", "bodies: expected 1 to 64, got 0"),
-        ("[input.merge]\ncameras = [7111, 7112]", "cameras: expected each to be a text, got 7111"),
-        ("[server]\nclients = [7111]", "clients: expected each to be a text, got 7111"),
         ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
         ("[vmc]\nport = 0", "port: expected 1 to 65535, got 0"),
         ("[vmc]\nhost = ''", "host: expected an address"),
@@ -79,10 +70,8 @@ def test_the_projects_own_files_are_found_by_name(name: str) -> None:
         ("[web]\nhost = ''", r"\[web\] host: expected"),
         ("[web]\ntoken = 'short'", r"\[web\] token: expected"),
         ("[web]\ntoken = 'with spaces, and so on'", r"\[web\] token: expected"),
-        ("[web]\nnames = [8766]", r"\[web\] names: expected each to be a text, got 8766"),
         ("[ros2]\nworld_frame = ''", "without a slash"),
         ("[ros2]\nworld_frame = '/map'", "without a slash"),
-        ("[recorder]\nsplit_mb = nan", "split_mb: expected a finite number"),
         ("[recorder]\nkeep_mb = 10\nsplit_mb = 10", "expected two parts or more, 20, got 10"),
         ("[recorder]\nsync_s = -1", "sync_s: expected 0 or more"),
         ("[input.ros2]\ntype = 'Image'", "expected MarkerArray or PoseArray, got 'Image'"),
@@ -109,10 +98,18 @@ def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expec
         Launch.read(write(text))
 
 
-def test_a_number_beyond_toml_is_text_to_an_override(write) -> None:
+def test_numbers_and_brackets_without_end_are_no_setting(write) -> None:
     for digits in (400, 5000):
         with pytest.raises(LaunchError, match=r"\[prior\] delay: expected int such as 4, got '10"):
             Launch.read(write(""), [f"prior.delay=1{digits * '0'}"])
+    for text in ("x = " + "[" * 5000, "[[" * 5000, "x = " + "{a=" * 5000):
+        with pytest.raises(LaunchError):
+            Launch.read(write(text))
+    with pytest.raises(LaunchError, match=r"input\.rate: lists or tables within lists"):
+        Launch.read(write(""), ["input.rate=" + "[" * 5000])
+    for nothing in ("input.rate", "=3", "input.rate.x=3"):
+        with pytest.raises(LaunchError):
+            Launch.read(write("[input]\nrate = 1"), [nothing])
 
 
 def test_a_missing_file_names_those_there_are() -> None:
@@ -138,6 +135,7 @@ def test_a_copied_launch_file_means_the_same(name: str, tmp_path: Path) -> None:
     copied = tmp_path / "mine.toml"
     copied.write_bytes(find(name).read_bytes())
     assert Launch.read(copied) == Launch.read(name)
+    assert Launch.read(copied).transport.lossless == (name == "replay"), "a camera waits for nobody"
 
 
 def test_the_users_own_file_comes_before_a_bundled_stream(write, tmp_path: Path) -> None:
@@ -167,12 +165,6 @@ def test_an_abbreviated_setting_is_completed_and_a_wrong_one_refused() -> None:
             in_launch_file("replay", [f"{wrong}=2"])
 
 
-@pytest.mark.parametrize("override", ["input.rate", "=3", "input.rate.x=3"])
-def test_an_override_that_sets_nothing_is_refused(write, override: str) -> None:
-    with pytest.raises(LaunchError):
-        Launch.read(write("[input]\nrate = 1"), [override])
-
-
 def test_who_must_hear_whom(write) -> None:
     launch = Launch.read(write("nodes = ['pose_input', 'prior', 'trajectory', 'recorder', 'viewer']"))
     assert launch.reliable_subscribers("pose_input") == {"prior", "recorder"}
@@ -181,14 +173,6 @@ def test_who_must_hear_whom(write) -> None:
     assert launch.reliable_subscribers("recorder") == frozenset()
     live = Launch.read(write("[transport]\nlossless = false"))
     assert live.reliable_subscribers("pose_input") == frozenset(), "a camera waits for nobody"
-
-
-def test_brackets_without_end_are_no_setting(write) -> None:
-    for text in ("x = " + "[" * 5000, "[[" * 5000, "x = " + "{a=" * 5000):
-        with pytest.raises(LaunchError):
-            Launch.read(write(text))
-    with pytest.raises(LaunchError, match=r"input\.rate: lists or tables within lists"):
-        Launch.read(write(""), ["input.rate=" + "[" * 5000])
 
 
 @pytest.mark.parametrize(
@@ -202,7 +186,7 @@ def test_brackets_without_end_are_no_setting(write) -> None:
 )
 def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str, former: list[str]) -> None:
     _warn_once.cache_clear()
-    launch = Launch.read(write(text), [full_key(override, pipeline_sections())])
+    launch = Launch.read(write(text), [module.full_key(override, module.pipeline_sections())])
     assert launch.settings(PriorSettings).person == PersonSettings(samples=40, every=4)
     warned = [record.getMessage().split()[1] for record in caplog.records]
     assert sorted(warned) == former, "once each"

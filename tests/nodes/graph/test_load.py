@@ -3,6 +3,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,10 @@ class Line:
         return None
 
 
+def inbox_of(clock: VirtualClock, *lines: Line, limit: int | None = 8) -> Inbox:
+    return Inbox(lines, limit=limit, clock=clock)  # type: ignore[arg-type]
+
+
 def at_once(*messages: PoseRaw | Diagnostics) -> list[tuple[int, PoseRaw | Diagnostics]]:
     return [(0, message) for message in messages]
 
@@ -58,7 +63,7 @@ def camera(clock: VirtualClock, seconds: float, source: str = "test") -> Line:
 
 @pytest.mark.parametrize(("work_ms", "latest_ms"), [(20, 34), (60, 134), (100, 200)])
 def test_the_newest_is_worked_on_however_slow_the_work(clock: VirtualClock, work_ms: int, latest_ms: int) -> None:
-    inbox, late = Inbox([camera(clock, 10.0)], limit=8, clock=clock), []  # type: ignore[list-item]
+    inbox, late = inbox_of(clock, camera(clock, 10.0)), []
     end_ns = clock.time_ns + 10 * 10**9
     while clock.time_ns < end_ns:
         received = inbox.next(0)
@@ -74,14 +79,14 @@ def test_the_newest_is_worked_on_however_slow_the_work(clock: VirtualClock, work
 def test_frames_too_old_in_a_clients_socket_do_not_keep_back_the_fresh_ones_behind(clock: VirtualClock) -> None:
     """They had cost one call each: a client that had once fallen behind a busy server was never heard again."""
     lines = [Line(clock, [(0, None)] * 30 + at_once(raw(30))), Line(clock, at_once(*frames(2)))]
-    inbox = Inbox(lines, limit=8, clock=clock)  # type: ignore[arg-type]
+    inbox = inbox_of(clock, *lines)
     assert [inbox.next(0), inbox.next(0)] == [(POSE_RAW, raw(30)), (POSE_RAW, raw(0))]
 
 
 def test_frames_that_come_late_together_are_all_worked_on(clock: VirtualClock) -> None:
     """A camera that stood still for a sixth of a second: its frames have waited for it, not for the node."""
     late = [(clock.time_ns + 10**8, raw(k, stamp_ns=clock.time_ns + k * FRAME_NS)) for k in range(5)]
-    inbox, worked = Inbox([Line(clock, late)], limit=8, clock=clock), 0  # type: ignore[list-item]
+    inbox, worked = inbox_of(clock, Line(clock, late)), 0
     for _ in range(200):
         worked += inbox.next(0) is not None
         clock.time_ns += 8_000_000
@@ -128,7 +133,7 @@ def kept(inbox: Inbox) -> list[Message]:
 def test_a_late_node_keeps_the_newest_frames_the_end_of_the_stream_and_the_news(clock: VirtualClock) -> None:
     end, news = dataclasses.replace(raw(5), end_of_stream=True), Diagnostics(0, "pose_input", Level.OK, "")
     line = Line(clock, at_once(*frames(5), end, news, *frames(20)))
-    inbox = Inbox([line], limit=3, clock=clock)  # type: ignore[list-item]
+    inbox = inbox_of(clock, line, limit=3)
     assert kept(inbox) == [end, news, *frames(20)[17:]]
     assert inbox.overrun == 22
 
@@ -137,15 +142,12 @@ def of_sources(count: int) -> list[PoseRaw]:
     return [dataclasses.replace(raw(0), source=f"kiosk {k}") for k in range(count)]
 
 
-def test_the_streams_of_one_publisher_do_not_displace_each_other(clock: VirtualClock) -> None:
+def test_the_streams_of_one_publisher_do_not_displace_each_other_and_fill_no_memory(clock: VirtualClock) -> None:
     inbox = Inbox([Line(clock, at_once(*of_sources(20)))], limit=1, clock=clock)  # type: ignore[list-item]
     assert len(kept(inbox)) == 20
     assert inbox.overrun == 0
-
-
-def test_a_publisher_of_ever_new_streams_fills_no_memory(clock: VirtualClock) -> None:
     line = Line(clock, at_once(*of_sources(LONGEST) * 4))
-    inbox = Inbox([line], limit=8, clock=clock)  # type: ignore[list-item]
+    inbox = inbox_of(clock, line)
     inbox.next(0)
     assert len(line.messages) == 4 * LONGEST - READ_AHEAD, "who sends without end does not keep it from working"
     while line.messages:  # it reads faster than it processes
@@ -179,7 +181,7 @@ def test_publishers_take_turns_and_who_floods_loses_its_own(tmp_path: Path, cloc
 
 def test_a_lossless_node_leaves_the_rest_to_the_sender(clock: VirtualClock) -> None:
     line = Line(clock, at_once(*frames(500)))
-    inbox = Inbox([line], limit=None, clock=clock)  # type: ignore[list-item]
+    inbox = inbox_of(clock, line, limit=None)
     assert inbox.next(0) is not None
     assert len(line.messages) == 500 - READ_AHEAD, "nor is a fast source read without end"
     assert len(kept(inbox)) == 499
@@ -315,10 +317,9 @@ def test_streams_are_examined_in_turn_and_none_is_left_out(clock: VirtualClock) 
 
 
 def test_the_inbox_says_whose_frames_it_dropped(clock: VirtualClock) -> None:
-    inbox = Inbox([camera(clock, 1.0)], limit=8, clock=clock)  # type: ignore[list-item]
+    inbox = inbox_of(clock, camera(clock, 1.0))
     clock.time_ns += LOOK_NS
-    received = inbox.next(0)
-    assert received
+    received: Any = inbox.next(0)
     assert inbox.sources == {"test"}
     assert inbox.dropped_of(received[1])
     assert not inbox.dropped_of(received[1]), "the frame after it follows on"

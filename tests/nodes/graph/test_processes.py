@@ -3,13 +3,13 @@ import os
 import re
 import signal
 import socket
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import runs
 from conftest import record, until, walk
-from runs import INPUT_ALONE, Run, runs
+from runs import INPUT_ALONE, Run
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
@@ -17,17 +17,7 @@ from steadypose.msgs.types import PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.sources.pose_input import LOOP_PAUSE_NS
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def start(folder: Path) -> Iterator[Callable[..., Run]]:
-    with runs(folder) as start:
-        yield start
-
-
-@pytest.fixture
-def recording(tmp_path: Path) -> Path:
-    return record(tmp_path / "in", walk(90))
+start, recording = runs.start, runs.recording
 
 
 def poses_recorded(directory: Path) -> bool:
@@ -63,24 +53,17 @@ def recorded(start: Any, recording: Path, tmp_path: Path) -> tuple[Run, list[int
     return run, [run.pid(name) for name in ("pose_input", "recorder")]
 
 
-@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGHUP])
-def test_ctrl_c_and_the_end_of_the_terminal_end_all_and_complete_the_recording(
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
+def test_ctrl_c_the_end_of_the_terminal_and_a_kill_end_all_and_complete_the_recording(
     recorded: tuple[Run, list[int]], tmp_path: Path, asked: signal.Signals
 ) -> None:
     run, nodes = recorded
     run.process.send_signal(asked)
     status, output = run.wait()
-    assert status == 0, output
-    assert not [pid for pid in nodes if Path(f"/proc/{pid}").exists()]
-    assert (tmp_path / "out/metadata.yaml").exists(), "the recorder was stopped, not killed"
-    with RecordingReader(tmp_path / "out") as reader:
-        assert reader.complete
-
-
-def test_nodes_do_not_outlive_a_run_that_is_killed(recorded: tuple[Run, list[int]], tmp_path: Path) -> None:
-    run, nodes = recorded
-    run.process.kill()
-    run.process.wait()
+    assert status == (-asked if asked == signal.SIGKILL else 0), output
+    if asked != signal.SIGKILL:
+        assert not [pid for pid in nodes if Path(f"/proc/{pid}").exists()]
+        assert (tmp_path / "out/metadata.yaml").exists(), "the recorder was stopped, not killed"
     until(lambda: not any(works(pid) for pid in nodes))
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.complete
@@ -109,9 +92,8 @@ def test_the_recorder_is_killed_and_goes_on_in_the_next_part(start: Any, recordi
     run: Run = start("--input", str(recording), "--record", str(out), "--loop", *INPUT_ALONE)
     for part in range(3):
         run.until_running("recorder")
-        until(lambda: len(list(out.glob("*.mcap"))) == part + 1, timeout_s=30)  # noqa: B023
         file = out / f"out_{part}.mcap"
-        until(lambda: file.stat().st_size > 20_000, timeout_s=30)  # noqa: B023
+        until(lambda: file.exists() and file.stat().st_size > 20_000, timeout_s=30)  # noqa: B023
         if part < 2:
             run.kill("recorder")
     status, output = run.end()
@@ -121,7 +103,6 @@ def test_the_recorder_is_killed_and_goes_on_in_the_next_part(start: Any, recordi
     assert stamps == sorted(set(stamps)), "none twice"
     within = [b - a for a, b in itertools.pairwise(stamps) if b - a < LOOP_PAUSE_NS]
     assert max(within) < 50_000_000, "none lost"
-    assert all((out / f"out_{part}.mcap").stat().st_size > 20_000 for part in range(3))
 
 
 def test_a_run_outlives_its_nodes_however_often_they_are_killed(start: Any, recording: Path) -> None:

@@ -2,11 +2,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, cycle
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import START_NS, VirtualClock, listeners, raw, repeated, running, until, walk, walking
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.publisher import SEND_HIGH_WATER
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_EVENTS, POSE_RAW, POSE_WORLD
@@ -43,76 +44,57 @@ class Echo(Node):
             self.publish(POSE_CLEAN, clean(message))
 
 
-class Listener:
+class Listener(Subscriber):
     """A test's own subscriber, which keeps what comes."""
 
     def __init__(self, launch: Launch, node: str, topics: list[str], name: str = "") -> None:
-        self._subscriber = Subscriber(launch.transport.endpoint(node), topics, name=name)
-        self.got: list[Message] = []
-
-    def take(self, timeout_s: float = 0.2) -> bool:
-        received = self._subscriber.receive(timeout_s)
-        if received:
-            self.got.append(received[1])
-        return received is not None
+        super().__init__(launch.transport.endpoint(node), topics, name=name)
+        self.got: list[Any] = []
 
     def take_until(self, condition: Callable[[], bool]) -> None:
-        until(lambda: self.take(0.05) and condition())
+        while not (self.got and condition()):
+            received = self.receive(30.0)
+            assert received, "nothing comes any more"
+            self.got.append(received[1])
 
-    def close(self) -> None:
-        self._subscriber.close()
 
-
-def test_every_frame_arrives_though_the_listener_comes_last(make_launch: MakeLaunch) -> None:
+def test_every_frame_arrives_though_the_listener_comes_last_and_goes_away_for_a_while(make_launch: MakeLaunch) -> None:
     launch = make_launch(nodes='["prior", "trajectory"]')
     node = Echo(launch)
     with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
-        news = Listener(launch, "prior", [DIAGNOSTICS])
-        news.take_until(lambda: news.got[-1].values["state"] == "waiting for trajectory")  # type: ignore[union-attr]
+        with Listener(launch, "prior", [DIAGNOSTICS]) as news:
+            news.take_until(lambda: news.got[-1].values["state"] == "waiting for trajectory")
         assert "prior" not in source.subscribers, "it must not listen before it is heard"
-        trajectory = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
-        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
-        for i in range(50):
-            source.publish(POSE_RAW, raw(i))
-        trajectory.take_until(lambda: len(trajectory.got) == 50)
-        assert [m.stamp_ns for m in trajectory.got] == [raw(i).stamp_ns for i in range(50)]
-        trajectory.close()
-        news.close()
-
-
-def test_the_stream_halts_while_a_listener_is_away(make_launch: MakeLaunch) -> None:
-    launch = make_launch(nodes='["prior", "trajectory"]')
-    node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
-        first = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
-        assert source.wait_for_subscribers({"prior"}, timeout_s=10)
-        source.publish(POSE_RAW, raw(0))
-        first.take_until(lambda: len(first.got) == 1)
-        first.close()
+        with Listener(launch, "prior", [POSE_CLEAN], name="trajectory") as trajectory:
+            assert source.wait_for_subscribers({"prior"}, timeout_s=10)
+            for i in range(50):
+                source.publish(POSE_RAW, raw(i))
+            trajectory.take_until(lambda: len(trajectory.got) == 50)
+            assert [m.stamp_ns for m in trajectory.got] == [raw(i).stamp_ns for i in range(50)]
         until(lambda: "trajectory" not in listeners(node))
-        for i in range(1, 10):
+        for i in range(50, 60):
             source.publish(POSE_RAW, raw(i))
-        again = Listener(launch, "prior", [POSE_CLEAN], name="trajectory")
-        again.take_until(lambda: len(again.got) == 9)
-        assert again.got[0].stamp_ns == raw(1).stamp_ns
-        again.close()
+        with Listener(launch, "prior", [POSE_CLEAN], name="trajectory") as again:
+            again.take_until(lambda: len(again.got) == 10)
+            assert again.got[0].stamp_ns == raw(50).stamp_ns
 
 
 def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch: MakeLaunch, caplog) -> None:
     launch = make_launch(nodes='["prior"]')
     node = Echo(launch)
-    with Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source, running(node):
-        listener = Listener(launch, "prior", [POSE_CLEAN], name="test")
+    with (
+        Publisher(launch.transport.endpoint("pose_input"), reliable={"prior"}) as source,
+        running(node),
+        Listener(launch, "prior", [POSE_CLEAN], name="test") as listener,
+    ):
         assert source.wait_for_subscribers({"prior"}, timeout_s=10)
         until(lambda: "test" in listeners(node))
         for i in range(6):
             source.publish(POSE_RAW, raw(i, skeleton="bad" if i % 2 else "smpl22"))
         listener.take_until(lambda: len(listener.got) == 3)
         until(lambda: node.health.counts["refused.ArithmeticError"] == 3)  # the last comes after the third answer
-        listener.close()
     assert sum("stumbled" in (record.exc_text or "") for record in caplog.records) == 1, "logged once"
-    report = node.diagnostics()
-    assert report.values["refused.ArithmeticError"] == "3"
+    assert node.diagnostics().values["refused.ArithmeticError"] == "3"
 
 
 def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLaunch, clock: VirtualClock) -> None:
@@ -152,11 +134,8 @@ def test_a_timeline_goes_through_diagnostics_and_back() -> None:
 
 def test_a_node_stops_though_it_waits_for_a_listener_who_never_comes(make_launch: MakeLaunch) -> None:
     node = Echo(make_launch(nodes='["prior", "trajectory"]'))
-    with running(node) as threads:
+    with running(node):  # which stops it
         until(lambda: node.health.state.startswith("waiting"))
-        node.stop()
-        threads[0].join(10)
-        assert not threads[0].is_alive()
 
 
 def test_a_node_stops_though_its_listener_does_not_read(make_launch: MakeLaunch) -> None:
@@ -196,8 +175,8 @@ def test_input_without_output_is_not_called_running(make_launch: MakeLaunch, clo
         assert node.diagnostics().values["state"] == "running", "nothing comes any more: that is no fault of its own"
 
 
-def test_a_restarted_node_counts_on_and_its_rates_are_its_own(clock: VirtualClock) -> None:
-    health = Health(clock)
+def test_a_restarted_node_counts_on_and_its_rates_are_its_own_and_one_moment_has_no_rate(clock: VirtualClock) -> None:
+    health, brief = Health(clock), Health(clock)
     health.go_on_from({POSE_RAW: 1000})
     for _ in range(31):
         health.note_published(POSE_RAW, clock.time_ns, None)
@@ -205,14 +184,10 @@ def test_a_restarted_node_counts_on_and_its_rates_are_its_own(clock: VirtualCloc
     values = health.report("pose_input", Counter(), {}).values
     assert values[f"count.{POSE_RAW}"] == "1031"
     assert values[f"rate.{POSE_RAW}"] == values[f"mean_rate.{POSE_RAW}"] == "20.00"
-
-
-def test_messages_of_one_moment_have_no_rate(clock: VirtualClock) -> None:
-    health = Health(clock)
     for _ in range(5):  # as when a recording of one frame ends
-        health.note_published(POSE_CLEAN, clock.time_ns, None)
+        brief.note_published(POSE_CLEAN, clock.time_ns, None)
         clock.time_ns += 100
-    assert f"mean_rate.{POSE_CLEAN}" not in health.report("prior", Counter(), {}).values
+    assert f"mean_rate.{POSE_CLEAN}" not in brief.report("prior", Counter(), {}).values
 
 
 HOUR_NS = 3_600_000_000_000
@@ -230,7 +205,7 @@ class SetClock(VirtualClock):
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
 def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_ns: int) -> None:
     clock, frames = SetClock(), walk(10)
-    node = PoseInputNode(make_launch(), clock, _Source())  # type: ignore[arg-type]
+    node = PoseInputNode(make_launch(), clock, object())  # type: ignore[arg-type]
     for k, frame in enumerate(frames):
         if k == 5:
             clock.set_ns += step_ns
@@ -243,23 +218,11 @@ def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_n
         assert abs(node.timeline.wall(frame.stamp_ns) - clock.now_ns()) < 1_000_000
 
 
-class _Source:
-    """In a recording's place: the test itself gives the frames."""
-
-
-class Idle(Node):
-    """A node of the graph that only measures."""
-
-    name = "prior"
-
-    def handle(self, topic: str, message: Message) -> None: ...
-
-
 @pytest.mark.parametrize("step_ns", [10 * 365 * 86400 * 10**9, -(10**9)])
 @pytest.mark.parametrize("rate", [1.0, 2.0])
 def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Launch], step_ns: int, rate: float) -> None:
     clock = SetClock()
-    node = Idle(make_launch(nodes='["prior"]'), clock)
+    node = Echo(make_launch(nodes='["prior"]'), clock)
     node.timeline = timeline = Timeline(1_000, clock.now_ns(), rate)
     clock.time_ns += 1_000_000_000
     stamp_ns = timeline.stamp_at(clock.now_ns()) - round(20_000_000 * rate)
@@ -268,13 +231,9 @@ def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Laun
     assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
 
 
-def worlds(seconds: float) -> list[PoseWorld]:
-    return [message for topic, message in messages(seconds) if topic == POSE_WORLD and isinstance(message, PoseWorld)]
-
-
 def test_a_message_is_sent_when_something_changes_and_once_a_second() -> None:
     stream = EventStream(EventSettings())
-    told = [(world.stamp_ns, stream.process(world)) for world in worlds(6.0)]
+    told = [(world.stamp_ns, stream.process(world)) for world in messages_on(POSE_WORLD, 6.0)]
     sent = [(stamp_ns, events) for stamp_ns, events in told if events]
     assert all(stamp_ns == events.stamp_ns for stamp_ns, events in sent)
     changed = [any(event.phase != Phase.HOLDS for event in events.events) for _, events in sent]
@@ -286,12 +245,12 @@ def test_a_message_is_sent_when_something_changes_and_once_a_second() -> None:
 
 def test_the_end_of_the_stream_is_passed_on_and_who_comes_after_it_enters() -> None:
     stream = EventStream(EventSettings())
-    first = worlds(1.0)
+    first = messages_on(POSE_WORLD, 1.0)
     for world in first:
         stream.process(world)
     end = stream.process(PoseWorld(first[-1].stamp_ns, "world", first[-1].source, np.array([0, 0, 1, 0]), [], True))
     assert end == PoseEvents(first[-1].stamp_ns, "world", first[-1].source, [], True)
-    again = [events for world in worlds(1.0) if (events := stream.process(world))]
+    again = [events for world in messages_on(POSE_WORLD, 1.0) if (events := stream.process(world))]
     assert any(event.kind == EventKind.ENTERED for events in again for event in events.events)
 
 
@@ -303,7 +262,7 @@ def test_events_are_off_unless_a_launch_file_has_them(make_launch: Callable[...,
 
 def test_the_node_publishes_what_the_trajectory_node_makes_known(make_launch: Callable[..., Launch]) -> None:
     launch = make_launch(nodes='["trajectory", "events"]', transport__lossless="false")
-    stream, stamps = cycle(worlds(1.0)), count(10**9, 33_333_333)
+    stream, stamps = cycle(messages_on(POSE_WORLD, 1.0)), count(10**9, 33_333_333)
     with (
         Publisher(launch.transport.endpoint("trajectory")) as publisher,
         running(EventsNode(launch)),

@@ -98,19 +98,14 @@ def test_counts_of_a_client_that_came_back_under_another_name_stay(make_launch: 
     assert node.status()["refused.sensor_pose_invalid"] == "3"
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
+def test_what_a_server_cannot_be_and_its_launch_file_goes_with_the_kiosks(make_launch: Callable[..., Launch]) -> None:
+    of = {"server__clients": '["tcp://127.0.0.1:1"]', "transport__lossless": "false"}
+    for wrong, expected in (
         ({"nodes": '["pose_input", "prior"]'}, "have their own pose_input"),
         ({"nodes": '["prior"]', "transport__lossless": "true"}, "lossless = false"),
-    ],
-)
-def test_what_a_server_cannot_be(make_launch: Callable[..., Launch], settings: dict[str, str], expected: str) -> None:
-    with pytest.raises(LaunchError, match=expected):
-        make_launch(server__clients='["tcp://127.0.0.1:1"]', **({"transport__lossless": "false"} | settings))
-
-
-def test_the_launch_files_belong_together() -> None:
+    ):
+        with pytest.raises(LaunchError, match=expected):
+            make_launch(**(of | wrong))
     server, own = Launch.read("server"), Launch.read("kiosk")
     assert own.transport.endpoint("pose_input") in server.addresses("pose_input")
     assert own.nodes == ["pose_input"]

@@ -3,14 +3,15 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import runs
 from conftest import record, running, until, walk
-from runs import INPUT_ALONE, Run, runs
+from runs import INPUT_ALONE, Run
 from tests.prior.clean.test_pipeline import loops
 
 from steadypose.msgs.recording import RecordingReader
@@ -30,17 +31,7 @@ from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.prior import loop_cache
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def start(folder: Path) -> Iterator[Callable[..., Run]]:
-    with runs(folder) as start:
-        yield start
-
-
-@pytest.fixture
-def recording(tmp_path: Path) -> Path:
-    return record(tmp_path / "in", walk(90))
+start, recording = runs.start, runs.recording
 
 
 def test_nohup_is_obeyed() -> None:
@@ -132,27 +123,19 @@ def test_poses_go_on_where_the_log_cannot_be_written(recording: Path, tmp_path: 
         assert reader.count(POSE_RAW) == 91
 
 
-def test_a_path_may_hold_any_character(start: Any, tmp_path: Path) -> None:
+def test_a_path_may_hold_any_character_and_beside_a_file_in_its_place_a_recording_is_made(
+    start: Any, tmp_path: Path
+) -> None:
     strange = tmp_path / 'a 😀 "b\x7f'
     strange.mkdir()
     source = record(strange / "in", walk(30))
-    out = strange / "out"
-    run: Run = start("--input", str(source), "--record", str(out), "--rate", "0", *INPUT_ALONE)
+    (strange / "mine.npz").touch()
+    run: Run = start("--input", str(source), "--record", str(strange / "mine.npz"), "--rate", "0", *INPUT_ALONE)
     status, output = run.wait()
     assert status == 0, output
-    with RecordingReader(out) as reader:
+    assert "mine.npz-2: mine.npz is there already" in output
+    with RecordingReader(strange / "mine.npz-2") as reader:
         assert reader.count(POSE_RAW) == 31
-
-
-def test_beside_a_file_in_its_place_a_recording_is_made(start: Any, recording: Path, tmp_path: Path) -> None:
-    taken = tmp_path / "mine.npz"
-    taken.touch()
-    run: Run = start("--input", str(recording), "--record", str(taken), "--rate", "0", *INPUT_ALONE)
-    status, output = run.wait()
-    assert status == 0, output
-    assert f"recording to {taken}-2: mine.npz is there already" in output
-    with RecordingReader(tmp_path / "mine.npz-2") as reader:
-        assert reader.count(POSE_RAW) == 91
 
 
 def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(recording: Path, make_launch, monkeypatch) -> None:

@@ -29,8 +29,14 @@ def test_a_declaration_names_what_exists(name: str) -> None:
         assert dataclasses.is_dataclass(load(declared.settings))
         assert declared.section
     assert declared.extra in {"", *EXTRAS}
-    if declared.preflight:
-        assert callable(load(declared.preflight))
+    assert not declared.preflight or callable(load(declared.preflight))
+    for publisher, topics in declared.subscribes.items():
+        assert set(topics) <= {*NODES[publisher].publishes, DIAGNOSTICS}, f"{name} of {publisher}"
+
+
+def test_every_topic_has_publishers() -> None:
+    assert all(publishers(topic) for topic in TOPICS)
+    assert publishers(DIAGNOSTICS) == list(POSE_NODES)
 
 
 @pytest.mark.parametrize("name", SOURCES)
@@ -43,18 +49,6 @@ def test_a_declaration_of_a_source_names_what_exists(name: str) -> None:
         assert dataclasses.is_dataclass(settings)
         # a class, or a function that chooses one
         assert not isinstance(opens, type) or issubclass(opens, LiveSource)
-
-
-def test_a_node_subscribes_to_what_another_publishes() -> None:
-    for name, declared in NODES.items():
-        for publisher, topics in declared.subscribes.items():
-            assert set(topics) <= {*NODES[publisher].publishes, DIAGNOSTICS}, f"{name} of {publisher}"
-
-
-def test_every_topic_has_publishers() -> None:
-    for topic in TOPICS:
-        assert publishers(topic), topic
-    assert publishers(DIAGNOSTICS) == list(POSE_NODES)
 
 
 def test_reading_a_launch_file_takes_none_of_the_nodes_libraries() -> None:

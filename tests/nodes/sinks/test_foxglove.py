@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from conftest import repeated, running, until
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.transport import Publisher
@@ -18,12 +18,12 @@ pytest.importorskip("foxglove", reason="the extra 'foxglove' is not installed")
 
 
 def test_a_client_gets_markers(make_launch: Callable[..., Launch]) -> None:
-    worlds = [message for topic, message in messages(1.0) if topic == POSE_WORLD]
+    last = messages_on(POSE_WORLD, 1.0)[-1]
     launch = make_launch(nodes='["trajectory", "foxglove"]', foxglove__port="0", transport__lossless="false")
     node = FoxgloveNode(launch)
     with Publisher(launch.transport.endpoint("trajectory")) as publisher, running(node):
         until(lambda: bool(node.url))
-        with repeated(lambda: publisher.publish(POSE_WORLD, worlds[-1])):
+        with repeated(lambda: publisher.publish(POSE_WORLD, last)):
             channel, got = first_message(int(node.url.rpartition(":")[2]), "/steadypose/markers")
     assert (channel["encoding"], channel["schemaName"]) == ("cdr", "visualization_msgs/msg/MarkerArray")
     assert "Marker[] markers" in channel["schema"]

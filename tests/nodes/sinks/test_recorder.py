@@ -1,6 +1,5 @@
 import errno
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -10,7 +9,6 @@ from conftest import VirtualClock, walk
 
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_RAW
-from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.sinks.recorder import AHEAD_NS, NO_ROOM, LogTimes, RecorderNode
 from steadypose.nodes.sources.recording import end_of
 
@@ -22,14 +20,17 @@ def free(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return usage
 
 
+@pytest.fixture
+def recorder(tmp_path: Path, make_launch, clock: VirtualClock, free: SimpleNamespace) -> RecorderNode:
+    """One that records to ``out``."""
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    node._writer = node._settings.writer()
+    return node
+
+
 @pytest.mark.parametrize(("free_mb", "left"), [(500.0, 10**7), (0.0, 10**5)])
 def test_messages_are_dropped_while_there_is_no_room_and_recorded_again_when_there_is(
-    tmp_path: Path,
-    make_launch: Callable[..., Launch],
-    clock: VirtualClock,
-    free: SimpleNamespace,
-    free_mb: float,
-    left: int,
+    tmp_path: Path, make_launch, clock: VirtualClock, free: SimpleNamespace, free_mb: float, left: int
 ) -> None:
     node = RecorderNode(make_launch(recorder__directory=tmp_path / "out", recorder__free_mb=free_mb), clock)
     node._writer = node._settings.writer()
@@ -44,25 +45,15 @@ def test_messages_are_dropped_while_there_is_no_room_and_recorded_again_when_the
         assert [m.stamp_ns for _, _, m in reader] == [f.stamp_ns for f in [*walk(90)[:30], *walk(90)[60:]]]
 
 
-def test_a_disk_that_is_full_before_it_was_noticed(
-    tmp_path: Path,
-    make_launch: Callable[..., Launch],
-    clock: VirtualClock,
-    free: SimpleNamespace,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
-    node._writer = node._settings.writer()
-    frames = walk(90)
-    for frame in frames[:60]:
-        node.handle(POSE_RAW, frame)
-
+def test_a_disk_that_is_full_before_it_was_noticed(tmp_path: Path, recorder: RecorderNode, monkeypatch) -> None:
+    assert recorder._writer
     full_disk = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    monkeypatch.setattr(node._writer._part._writer, "flush", full_disk)
-    for frame in frames[60:]:
-        node.handle(POSE_RAW, frame)
-    node._writer.close()
-    assert 0 < node.health.counts[NO_ROOM] <= 30
+    for index, frame in enumerate(walk(90)):
+        if index == 60:
+            monkeypatch.setattr(recorder._writer._part._writer, "flush", full_disk)
+        recorder.handle(POSE_RAW, frame)
+    recorder._writer.close()
+    assert 0 < recorder.health.counts[NO_ROOM] <= 30
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.count(POSE_RAW) > 30, "half a second before it at most is lost"
 
@@ -84,17 +75,13 @@ def test_log_times_follow_the_stamps_but_neither_back_nor_to_a_wrong_one(
     assert [log_times.next(POSE_RAW, stamp) for stamp in stamps] == expected
 
 
-def test_what_a_killed_recorder_had_not_written_was_not_taken(
-    tmp_path: Path, make_launch: Callable[..., Launch], clock: VirtualClock, free: SimpleNamespace
-) -> None:
-    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
-    node._writer = node._settings.writer()
+def test_what_a_killed_recorder_had_not_written_was_not_taken(tmp_path: Path, recorder: RecorderNode) -> None:
     settled = []
     for frame in walk(40):
-        node.handle(POSE_RAW, frame)
-        settled.append(node.settle())
+        recorder.handle(POSE_RAW, frame)
+        settled.append(recorder.settle())
         with RecordingReader(tmp_path / "out") as reader:
             assert not settled[-1] or reader.count(POSE_RAW) == len(settled)
     assert settled.count(True) == 3, "as often as the writer gives what it has to the system"
-    node.handle(POSE_RAW, end_of(walk(40)[-1]))
-    assert node.settle(), "who hears of the end may stop the recorder"
+    recorder.handle(POSE_RAW, end_of(walk(40)[-1]))
+    assert recorder.settle(), "who hears of the end may stop the recorder"

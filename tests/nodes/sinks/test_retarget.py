@@ -4,16 +4,16 @@ from dataclasses import replace
 from functools import cache
 from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from conftest import first_datagram
+from conftest import first_datagram, record
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose import PACKAGE
-from steadypose.msgs.recording import RecordingWriter
-from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
+from steadypose.msgs.topics import POSE_TRUTH
 from steadypose.msgs.types import CONTACTS, Pose, PoseRaw, PoseWorld, RawBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.graph.launch import Launch, bundled
@@ -213,14 +213,12 @@ def test_a_foot_steps_where_the_person_s_is_far_or_turned_from_it(moved: float, 
 
 def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:
     retargeter, (first, second) = Retargeter(robot), worlds("idle")[:2]
-    before = retargeter.follow(first.stamp_ns, first.bodies[0])
+    before: Any = retargeter.follow(first.stamp_ns, first.bodies[0])
     positions = second.bodies[0].positions.copy()
     positions[4] = np.nan
     assert retargeter.follow(second.stamp_ns, replace(second.bodies[0], positions=positions)) is None
     assert retargeter.follow(first.stamp_ns, first.bodies[0]) is None
-    after = retargeter.coast(second.stamp_ns)
-    assert before is not None
-    assert after is not None
+    after: Any = retargeter.coast(second.stamp_ns)
     np.testing.assert_array_equal(before.joints, after.joints)
 
 
@@ -239,14 +237,10 @@ def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, s
     file.write_text(URDF.read_text().replace(old, new))
     with pytest.raises(LaunchError, match=said):
         load_robot(file, {})
-
-
-def test_links_are_named_where_their_names_do_not_tell(tmp_path: Path) -> None:
-    file = tmp_path / "robot.urdf"
-    file.write_text(URDF.read_text().replace("left_knee_link", "left_middle_link"))
-    assert load_robot(file, {"left_knee": "left_middle_link"}).links["left_knee"] == "left_middle_link"
-    with pytest.raises(LaunchError, match="no part left_nee"):
-        load_robot(file, {"left_nee": "left_middle_link"})
+    if new == "left_middle_link":
+        assert load_robot(file, {"left_knee": new}).links["left_knee"] == new
+        with pytest.raises(LaunchError, match="no part left_nee"):
+            load_robot(file, {"left_nee": new})
 
 
 def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
@@ -257,22 +251,39 @@ def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
 
 
 def test_the_command_follows_the_cleaned_poses_and_not_the_truth_beside_them(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "in") as writer:
-        for world in worlds("idle")[:20]:
-            body = RawBody(1, world.bodies[0].positions, np.ones(22))
-            raw = PoseRaw(world.stamp_ns, "world", "test", "smpl22", Pose.identity(), True, [body])
-            writer.write(POSE_RAW, raw, raw.stamp_ns)
-            elsewhere = replace(world.bodies[0], positions=world.bodies[0].positions + [50.0, 0, 0])
-            writer.write(POSE_TRUTH, replace(world, bodies=[elsewhere]), raw.stamp_ns)
+    stream = []
+    for world in worlds("idle")[:20]:
+        body = RawBody(1, world.bodies[0].positions, np.ones(22))
+        stream.append(PoseRaw(world.stamp_ns, "world", "test", "smpl22", Pose.identity(), True, [body]))
+        elsewhere = replace(world.bodies[0], positions=world.bodies[0].positions + [50.0, 0, 0])
+        stream.append((POSE_TRUTH, replace(world, bodies=[elsewhere])))
+    record(tmp_path / "in", stream)
     assert main(["retarget", str(tmp_path / "in"), str(tmp_path / "out.npz"), "--urdf", str(URDF)]) == 0
     with np.load(tmp_path / "out.npz") as found:
         assert found["root"][:, 0].max() < 20.0
 
 
-def test_the_command_tells_what_is_wrong_with_its_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    upright = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]])
-    np.savez(tmp_path / "in.npz", positions=upright[..., [1, 2, 0]], skeleton="smpl22", fps=30.0)  # y is up
-    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.npz"), "--urdf", str(URDF)]) == 1
+def test_the_command_writes_csv_and_npz_and_tells_what_is_wrong(tmp_path: Path, capsys) -> None:
+    upright, given = np.stack([world.bodies[0].positions for world in worlds("idle")[:60]]), ["--urdf", str(URDF)]
+    for name, joints in (("in.npz", upright[:20]), ("y.npz", upright[..., [1, 2, 0]])):  # y is up
+        np.savez(tmp_path / name, positions=joints, skeleton="smpl22", fps=30.0)
+
+    def retarget(source: str, out: str, *more: str) -> int:
+        return main(["retarget", str(tmp_path / source), str(tmp_path / out), *more])
+
+    assert [retarget("in.npz", name, *given) for name in ("out.csv", "out.npz")] == [0, 0]
+    table: Any = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    arrays = np.load(tmp_path / "out.npz")
+    assert table.dtype.names[0] == "time"
+    assert list(table.dtype.names[8:]) == arrays["joint_names"].tolist()
+    np.testing.assert_allclose(table["left_knee_joint"], arrays["joints"][:, 3], atol=1e-5)
+    assert retarget("in.npz", "out.csv", *given) == 2
+    assert "--force to replace it" in capsys.readouterr().err
+    assert [retarget("in.npz", "out.bvh", *given), retarget("in.npz", "out2.csv")] == [2, 2]
+    said = capsys.readouterr().err
+    assert "expected --urdf FILE" in said
+    assert str(URDF) in said, "which is there wherever the package is installed"
+    assert retarget("y.npz", "y.csv", *given) == 1
     assert "up_axis" in capsys.readouterr().err
 
 
@@ -293,24 +304,3 @@ def test_the_study_finds_a_breach_a_joint_too_fast_and_feet_that_slide_or_sink(r
     assert found["speed"] > 1.0
     assert found["foot_mm"] == pytest.approx(50.0)
     assert found["standing"] == pytest.approx(200 / 3)
-
-
-def test_the_command_writes_csv_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    p = np.stack([world.bodies[0].positions for world in worlds("idle")[:20]])
-    np.savez(tmp_path / "in.npz", positions=p, skeleton="smpl22", fps=30.0)
-    given = ["--urdf", str(URDF)]
-    for name in ("out.csv", "out.npz"):
-        assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / name), *given]) == 0
-    table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
-    arrays = np.load(tmp_path / "out.npz")
-    assert table.dtype.names
-    assert table.dtype.names[0] == "time"
-    assert list(table.dtype.names[8:]) == arrays["joint_names"].tolist()
-    np.testing.assert_allclose(table["left_knee_joint"], arrays["joints"][:, 3], atol=1e-5)
-    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.csv"), *given]) == 2
-    assert "--force to replace it" in capsys.readouterr().err
-    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out.bvh"), *given]) == 2
-    assert main(["retarget", str(tmp_path / "in.npz"), str(tmp_path / "out2.csv")]) == 2
-    said = capsys.readouterr().err
-    assert "expected --urdf FILE" in said
-    assert str(URDF) in said, "which is there wherever the package is installed"

@@ -16,7 +16,7 @@ from conftest import VirtualClock, running, until
 from scipy.spatial.transform import Rotation
 from tests.helpers.processes import another_python
 from tests.helpers.ros_output import Kept
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.codec import decode
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_WORLD
@@ -74,10 +74,7 @@ NEWS = Diagnostics(1, "prior", Level.WARN, "late", {"dropped.late": "3"})
 @pytest.fixture(scope="module")
 def stream() -> Stream:
     """A second of two bodies that walk, one of which has an arm hidden."""
-    found = list(messages(3.0, bodies=2))
-    cleans = [message for topic, message in found if topic == POSE_CLEAN]
-    worlds = [message for topic, message in found if topic == POSE_WORLD]
-    return cleans[-20:], worlds[-20:]  # type: ignore[return-value]
+    return tuple(messages_on(topic, 3.0, bodies=2)[-20:] for topic in (POSE_CLEAN, POSE_WORLD))  # type: ignore[return-value]
 
 
 @pytest.mark.slow
@@ -157,21 +154,16 @@ def xyz(point: Any) -> list[float]:
     return [point.x, point.y, point.z]
 
 
-def test_the_whole_message_goes_out_in_its_own_type(stream: Stream) -> None:
-    kept = Kept()
-    topics = BodyTopics(kept, "map")
+def test_the_whole_message_goes_out_in_its_own_type_and_transforms_lead_to_every_link(stream: Stream) -> None:
+    kept, buffer = Kept(), TransformBuffer()
+    topics = BodyTopics(kept, "odom")
     clean, world = stream[0][-1], stream[1][-1]
     topics.send(clean)
     topics.send(world)
     sent = {topic: cdr for topic, _, cdr, _ in kept.sent}
     assert decode(POSE_CLEAN, sent["steadypose/pose_clean"]) == clean
-    assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="map")
-
-
-def test_transforms_lead_to_every_link(stream: Stream) -> None:
-    kept, buffer, world = Kept(), TransformBuffer(), stream[1][-1]
-    BodyTopics(kept, "odom").send(world)
-    (told,) = kept.of("tf")
+    assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="odom")
+    told = kept.of("tf")[-1]
     buffer.add(told, static=False)
     assert {it.child_frame_id for it in told.transforms} == {
         f"{link}_{body}" for link in LINKS for body in ("b0", "b1")

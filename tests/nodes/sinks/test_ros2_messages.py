@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from conftest import running, until
 from tests.helpers.processes import another_python
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.codec import DEFINITIONS, encode
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
@@ -114,11 +114,7 @@ def fields_of(message: Message) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def stream() -> dict[str, list[Message]]:
     """Two seconds and a half of two bodies, one joint hidden towards the end."""
-    found = list(messages(2.5, bodies=2))
-    return {
-        wanted: [message for topic, message in found if topic == wanted]
-        for wanted in (POSE_RAW, POSE_CLEAN, POSE_WORLD)
-    }
+    return {topic: messages_on(topic, 2.5, bodies=2) for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD)}
 
 
 @pytest.mark.parametrize("kind", sorted(path.stem for path in DEFINITIONS.glob("*.msg")))

@@ -1,4 +1,3 @@
-import contextlib
 import itertools
 import os
 import select
@@ -6,20 +5,22 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.helpers.synthetic_poses import CAMERA, messages, walker
+from conftest import until
+from tests.helpers.synthetic_poses import messages, messages_on, walker
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
-from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseRaw, RawBody, Tracking
+from steadypose.msgs.types import Diagnostics, JointState, Level, Pose, PoseRaw, Tracking
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.topology import TransportSettings
 from steadypose.nodes.sinks.viewer import scene
@@ -80,10 +81,6 @@ def colours(archetype: Any) -> set[str]:
     return {f"#{int(colour) >> 8:06x}" for colour in archetype.colors.as_arrow_array().to_pylist()}
 
 
-def only(stream: Iterable[tuple[str, Message]], *topics: str) -> list[Any]:
-    return [message for topic, message in stream if topic in topics]
-
-
 def draw(view: PoseView, seconds: float, *topics: str) -> None:
     """A walker, as these topics tell of him."""
     for topic, message in messages(seconds):
@@ -102,7 +99,7 @@ def test_raw_and_clean_stand_upright_at_the_same_place(view: PoseView, log: Log)
 
 
 def test_bones_have_the_colours_of_their_sides_and_are_faint_where_not_observed(view: PoseView, log: Log) -> None:
-    message = only(messages(0.5), POSE_CLEAN)[0]
+    message = messages_on(POSE_CLEAN, 0.5)[0]
     for state, sides in ((JointState.REFINED, SIDE_RGB), (JointState.IMPUTED, FAINT_RGB)):
         message.bodies[0].state[:] = state
         view.log(POSE_CLEAN, message)
@@ -110,24 +107,19 @@ def test_bones_have_the_colours_of_their_sides_and_are_faint_where_not_observed(
     assert len(log.last("clean/made-up/0/sigma").half_sizes.as_arrow_array()) == 22
 
 
-def test_missing_joints_are_not_drawn(view: PoseView, log: Log) -> None:
-    message = only(messages(0.1), POSE_RAW)[0]
-    message.bodies[0].positions[3:] = np.nan
-    view.log(POSE_RAW, message)
+def test_missing_joints_are_not_drawn_and_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
+    both, leaving = messages_on(POSE_RAW, 0.3, bodies=2)[-2:]
+    both.bodies[0].positions[3:] = np.nan
+    view.log(POSE_RAW, both)
     assert len(points(log.last("raw/made-up/0/joints"))) == 3
-
-
-def test_a_body_that_left_is_cleared(view: PoseView, log: Log) -> None:
-    both, leaving = only(messages(0.3, bodies=2), POSE_WORLD)[-2:]
-    view.log(POSE_WORLD, both)
     leaving.bodies.pop()
-    view.log(POSE_WORLD, leaving)
-    assert isinstance(log.last("world/made-up/1"), rr.Clear)
+    view.log(POSE_RAW, leaving)
+    assert isinstance(log.last("raw/made-up/1"), rr.Clear)
 
 
 def test_tracking_and_path_are_told_in_the_world(view: PoseView, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene, "PATH_SECONDS", 2.0)
-    stream = only(messages(3.0), POSE_WORLD)
+    stream = messages_on(POSE_WORLD, 3.0)
     stream[-1].bodies[0].tracking = Tracking.COASTING
     for message in stream:
         view.log(POSE_WORLD, message)
@@ -158,7 +150,7 @@ def test_rates_are_the_nodes_own(view: PoseView, log: Log) -> None:
 
 
 def test_anomaly_is_drawn_once_there_is_a_score(view: PoseView, log: Log) -> None:
-    unscored, *stream = only(messages(1.0), POSE_CLEAN)
+    unscored, *stream = messages_on(POSE_CLEAN, 1.0)
     unscored.bodies[0].anomaly = np.nan
     view.log(POSE_CLEAN, unscored)
     blueprints = log.blueprints
@@ -178,7 +170,7 @@ def test_time_goes_on_when_stamps_jump_back(view: PoseView, log: Log) -> None:
 
 
 def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: Log) -> None:
-    stream = only(messages(4.0), POSE_RAW)
+    stream = messages_on(POSE_RAW, 4.0)
     stream[60].bodies[0].positions[:] = 1e4
     for message in stream:
         view.log(POSE_RAW, message)
@@ -192,19 +184,15 @@ def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: 
         (lambda m: setattr(m, "skeleton", "octopus8"), "unknown skeleton 'octopus8'"),
         (lambda m: setattr(m.bodies[0], "positions", np.zeros((3, 3), np.float32)), "has 32 joints, got 3"),
         (lambda m: setattr(m, "sensor_pose", Pose(np.zeros(3), np.zeros(4))), "norm"),
+        (lambda m: setattr(m, "source", "") or m.bodies[0].positions.fill(np.nan), ""),
+        (lambda m: m.bodies[0].positions.fill(np.inf) or m.bodies[0].confidence.fill(np.nan), ""),
     ],
 )
 def test_what_cannot_be_drawn_says_why(view: PoseView, spoil, expected: str) -> None:
-    message = only(messages(0.1), POSE_RAW)[0]
+    message = messages_on(POSE_RAW, 0.1)[0]
     spoil(message)
-    with pytest.raises(ValueError, match=expected):
+    with pytest.raises(ValueError, match=expected) if expected else nullcontext():
         view.log(POSE_RAW, message)
-
-
-def test_nothing_seen_and_nonsense_are_drawn_without_complaint(view: PoseView) -> None:
-    nothing = RawBody(0, np.full((32, 3), np.nan, np.float32), np.zeros(32, np.float32))
-    nonsense = RawBody(1, np.full((32, 3), np.inf, np.float32), np.full(32, np.nan, np.float32))
-    view.log(POSE_RAW, PoseRaw(0, "", "", "azure_kinect32", CAMERA, False, [nothing, nonsense]))
 
 
 def free_port() -> int:
@@ -245,18 +233,13 @@ def test_the_server_goes_with_a_node_that_is_killed() -> None:
     assert select.select([watch], [], [], 10.0)[0], "the server outlived its node"
 
 
-class Server:
+class Server(nullcontext[Any]):
     """Stands in for `ViewerServer`: no process."""
 
-    url = "http://somewhere"
-    stopped = False
+    url, stopped = "http://somewhere", False
 
-    def __init__(self, port: int, host: str) -> None: ...
-
-    def __enter__(self) -> Any:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
+    def __init__(self, port: int, host: str) -> None:
+        super().__init__(self)
 
     def check(self) -> None:
         if self.stopped:
@@ -267,27 +250,19 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(tmp_path: Pat
     monkeypatch.setattr(viewer_server, "ViewerServer", Server)
     monkeypatch.setattr(Server, "connect", lambda self: log, raising=False)
     launch = Launch(transport=TransportSettings(directory=str(tmp_path)))
-    node = ViewerNode(launch)
-    raised: list[RuntimeError] = []
+    node, stream = ViewerNode(launch), itertools.cycle(messages_on(POSE_CLEAN, 1.0))
+    with Publisher(launch.transport.endpoint("prior")) as publisher, ThreadPoolExecutor(1) as thread:
+        ends = thread.submit(node.run)
 
-    def run() -> None:
-        try:
-            node.run()
-        except RuntimeError as error:
-            raised.append(error)
+        def drawn() -> bool:
+            publisher.publish(POSE_CLEAN, next(stream))
+            return any(path.startswith("clean/") for _, path, _ in log.drawn)
 
-    thread = threading.Thread(target=run, daemon=True)
-    with Publisher(launch.transport.endpoint("prior")) as publisher:
-        thread.start()
-        for message in itertools.islice(itertools.cycle(only(messages(1.0), POSE_CLEAN)), 5_000):
-            publisher.publish(POSE_CLEAN, message)
-            thread.join(0.005)
-            if any(path.startswith("clean/") for _, path, _ in log.drawn):
-                break
+        until(drawn)
         monkeypatch.setattr(Server, "stopped", True)
-        thread.join(10.0)
+        with pytest.raises(RuntimeError, match="stopped"):  # with its server gone the node ends, to be started again
+            ends.result(10.0)
     assert log.last("clean/made-up/0/bones") is not None
-    assert raised, "with its server gone the node ends, to be started again"
     assert log.disconnected
 
 
@@ -302,13 +277,11 @@ def test_the_page_may_call_nobody_but_this_server(server: ViewerServer) -> None:
     assert not [word for rule in rules.values() for word in rule.split() if word in ("*", "http:", "https:")]
 
 
-def asked(url: str, host: str | None = None) -> int:
-    request = urllib.request.Request(url, headers={"Host": host} if host else {})
-    try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return answer.status
-    except urllib.error.HTTPError as error:
-        return error.code
+def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) -> None:
+    for url in (server.url, server.data_url):
+        request = urllib.request.Request(url, headers={"Host": "evil.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=20)
 
 
 def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> None:
@@ -318,15 +291,9 @@ def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> N
         assert answer.read(3) == b"RRF"
     at, token, name = server.data_url.rsplit("/", 2)
     for guess in ("", f"/{name}", f"/{'x' * len(token)}/{name}", f"/{token[:-1]}/{name}", f"/{token}/./{name}"):
-        with contextlib.suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
+        with suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
             assert not answer.read().startswith(b"RRF"), guess
     recording.disconnect()
-
-
-def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) -> None:
-    for url in (server.url, server.data_url):
-        assert asked(url, host="evil.example") == 403
-    assert asked(server.url) == 200
 
 
 def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,7 +316,7 @@ def test_a_browser_that_comes_late_gets_the_beginning_and_what_is_kept(monkeypat
 
 
 def test_an_image_is_drawn_with_the_clean_poses_of_its_moment_and_not_before(view: PoseView, log: Log) -> None:
-    cleaned = only(messages(0.5), POSE_CLEAN)
+    cleaned = messages_on(POSE_CLEAN, 0.5)
     layouts = log.blueprints
     view.keep(CameraImage(cleaned[1].stamp_ns, (480, 360), np.eye(3), b"a jpeg"))
     view.log(POSE_CLEAN, cleaned[0])

@@ -23,8 +23,7 @@ from steadypose.nodes.sinks.datagrams import BONES, VmcNode, osc_bundles
 
 def world() -> PoseWorld:
     """Of somebody who walks, as it truly was."""
-    *_, last = (m for topic, m in synthetic_poses.messages(0.5) if topic == POSE_TRUTH and isinstance(m, PoseWorld))
-    return last
+    return synthetic_poses.messages_on(POSE_TRUTH, 0.5)[-1]
 
 
 def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
@@ -33,7 +32,7 @@ def messages(bundles: list[bytes]) -> list[tuple[str, list[object]]]:
     return [(content.address, list(content.params)) for content in contents if isinstance(content, OscMessage)]
 
 
-def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
+def test_the_bones_give_the_body_back_in_unitys_axes_and_nobody_is_said_too() -> None:
     body = world().bodies[0]
     bundles = osc_bundles(1.5, body)
     assert all(len(data) < 1400 for data in bundles)
@@ -52,9 +51,6 @@ def test_the_bones_give_the_body_back_in_unitys_axes() -> None:
         turned[joint] = turn if parent < 0 else turned[parent] * turn
     right, up, forward = placed.T
     np.testing.assert_allclose(np.stack([forward, -right, up], axis=1), body.positions, atol=1e-4)
-
-
-def test_nobody_is_said_too() -> None:
     assert messages(osc_bundles(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
 
 

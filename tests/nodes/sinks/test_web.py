@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import repeated, running, until
 from tests.helpers.msg_strategies import diagnostics, events, raw, world
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
 from steadypose.msgs.transport import Publisher
@@ -95,7 +95,7 @@ def test_without_the_token_nothing_is_told(server: WebServer, token: str) -> Non
     assert server.clients == 0
 
 
-def test_a_client_gets_names_first_and_then_the_newest_of_each_stream(server: WebServer) -> None:
+def test_a_client_gets_names_first_then_the_newest_of_each_stream_and_all_events(server: WebServer) -> None:
     server.send("a", '"old"', replaces=True)
     server.send("a", '"new"', replaces=True)
     server.send("b", '"b"', replaces=True)
@@ -104,6 +104,13 @@ def test_a_client_gets_names_first_and_then_the_newest_of_each_stream(server: We
         assert {it.recv(20), it.recv(20)} == {'"new"', '"b"'}
         server.send("a", '"newer"', replaces=True)
         assert it.recv(20) == '"newer"'
+        for index in range(50):
+            server.send("e", json.dumps(index), replaces=False)
+        assert [json.loads(it.recv(20)) for _ in range(50)] == list(range(50)), "kept for who is slow for a moment"
+        for _ in range(300):  # it may send what it likes, and leave
+            it.send("x" * 1000)
+        assert it.ping().wait(20)  # the pong comes after what was sent was read
+    until(lambda: server.clients == 0)
 
 
 def test_who_is_slow_misses_frames_that_are_counted_and_holds_up_nobody(server: WebServer) -> None:
@@ -122,15 +129,7 @@ def test_who_is_slow_misses_frames_that_are_counted_and_holds_up_nobody(server: 
             last = index
 
 
-def test_events_are_kept_for_who_is_slow_for_a_moment(server: WebServer) -> None:
-    with client(server) as it:
-        it.recv(20)
-        for index in range(50):
-            server.send("e", json.dumps(index), replaces=False)
-        assert [json.loads(it.recv(20)) for _ in range(50)] == list(range(50))
-
-
-def test_there_are_no_more_clients_than_there_is_room_for(server: WebServer) -> None:
+def test_there_are_no_more_clients_than_there_is_room_for_and_one_server_at_a_port(server: WebServer) -> None:
     from websockets.exceptions import InvalidStatus
 
     with ExitStack() as stack:
@@ -140,17 +139,6 @@ def test_there_are_no_more_clients_than_there_is_room_for(server: WebServer) -> 
         with pytest.raises(InvalidStatus, match="503"), client(server):
             pass
     until(lambda: server.clients == 0)
-
-
-def test_a_client_may_send_what_it_likes_and_leave(server: WebServer) -> None:
-    with client(server) as it:
-        for _ in range(300):
-            it.send("x" * 1000)
-        assert it.ping().wait(20)  # the pong comes after what was sent was read
-    until(lambda: server.clients == 0)
-
-
-def test_a_port_that_is_taken_is_named(server: WebServer) -> None:
     with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 is not to be had"):
         WebServer("127.0.0.1", server.port, [], TOKEN, hello())
 
@@ -176,17 +164,14 @@ def test_messages_as_json() -> None:
     assert to_json(raw()) is None
 
 
-def test_the_token_is_kept_where_only_this_user_reads(tmp_path: Path) -> None:
+@pytest.mark.parametrize("found_no_room", [False, True])
+def test_the_token_is_kept_where_only_this_user_reads(tmp_path: Path, found_no_room: bool) -> None:
+    if found_no_room:  # on the disk, when it was drawn
+        (tmp_path / "token").touch(0o600)
     token = kept_token(tmp_path / "token")
     assert len(token) >= 32
     assert kept_token(tmp_path / "token") == token
     assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
-
-
-def test_a_token_that_found_no_room_on_the_disk_is_drawn_again(tmp_path: Path) -> None:
-    (tmp_path / "token").touch()
-    assert len(token := kept_token(tmp_path / "token")) >= 32
-    assert kept_token(tmp_path / "token") == token
 
 
 def test_nodes_that_start_at_once_draw_one_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,9 +192,8 @@ def test_nodes_that_start_at_once_draw_one_token(tmp_path: Path, monkeypatch: py
 
 
 def test_the_node_serves_what_the_others_publish(make_launch: Callable[..., Launch]) -> None:
-    worlds = [message for topic, message in messages(1.0) if topic == POSE_WORLD]
     launch = make_launch(nodes='["trajectory", "events", "web"]', web__port="0", transport__lossless="false")
-    node, topics = WebNode(launch), set()
+    node, topics, last = WebNode(launch), set(), messages_on(POSE_WORLD, 1.0)[-1]
     with (
         Publisher(launch.transport.endpoint("trajectory")) as trajectory,
         Publisher(launch.transport.endpoint("events")) as others,
@@ -220,7 +204,7 @@ def test_the_node_serves_what_the_others_publish(make_launch: Callable[..., Laun
         token = urlsplit(node.url).fragment
 
         def publish() -> None:
-            trajectory.publish(POSE_WORLD, worlds[-1])
+            trajectory.publish(POSE_WORLD, last)
             others.publish(POSE_EVENTS, events())
 
         with repeated(publish), client(node._server, token) as it:

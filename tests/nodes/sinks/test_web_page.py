@@ -10,10 +10,10 @@ import pytest
 from conftest import until
 from PIL import Image
 from tests.helpers.msg_strategies import diagnostics
-from tests.helpers.synthetic_poses import messages
+from tests.helpers.synthetic_poses import messages_on
 
 from steadypose.msgs.topics import POSE_EVENTS, POSE_WORLD
-from steadypose.msgs.types import Event, EventKind, Hand, Message, Phase, PoseEvents, PoseWorld
+from steadypose.msgs.types import Event, EventKind, Hand, Message, Phase, PoseEvents
 from steadypose.nodes.sinks.web.node import hello, to_json
 from steadypose.nodes.sinks.web.server import WebServer
 
@@ -65,10 +65,6 @@ def told(kind: EventKind, phase: Phase, hand: Hand = Hand.NONE, body: int = 7) -
     return PoseEvents(10**9, "world", "test", [Event(body, kind, phase, hand, 0.9, np.zeros(3), 10**9)])
 
 
-def worlds() -> list[PoseWorld]:
-    return [message for _, message in messages(1.0) if isinstance(message, PoseWorld)]
-
-
 def pixels(page: Any, colour: tuple[int, int, int]) -> int:
     image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
     return int((np.abs(image[:, :680] - colour).max(axis=-1) < 30).sum())
@@ -76,7 +72,7 @@ def pixels(page: Any, colour: tuple[int, int, int]) -> int:
 
 def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(server: WebServer, opened: Any) -> None:
     page = opened("/")
-    for message in worlds():
+    for message in messages_on(POSE_WORLD, 1.0):
         send(server, POSE_WORLD, message)
     send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT))
     send(server, "diagnostics", diagnostics())
@@ -98,7 +94,7 @@ def test_bodies_of_all_clients_of_a_server_are_drawn_under_their_names_until_the
           CanvasRenderingContext2D.prototype.fillText = (text) => { globalThis.labels.push(text); };
         }"""
     )
-    last = worlds()[-1]
+    last = messages_on(POSE_WORLD, 1.0)[-1]
     for source in ("Küche 1", "厨房"):
         send(server, f"{POSE_WORLD}/{source}", dataclasses.replace(last, source=source))
     names = [f"{source} {body.id}" for source in ("Küche 1", "厨房") for body in last.bodies]
@@ -114,7 +110,7 @@ def test_the_last_poses_stay_when_the_stream_has_ended_and_the_server_with_it(br
     server = WebServer("127.0.0.1", 0, [], "a-token-of-this-test", hello())
     page = browser.new_page(viewport={"width": 1000, "height": 600})
     page.goto(server.url)
-    last = worlds()[-1]
+    last = messages_on(POSE_WORLD, 1.0)[-1]
     send(server, POSE_WORLD, last)
     until(lambda: pixels(page, LEFT) > 500, timeout_s=SOON_S)
     send(server, POSE_WORLD, dataclasses.replace(last, bodies=[], end_of_stream=True))
@@ -135,7 +131,7 @@ def test_the_last_poses_stay_when_the_stream_has_ended_and_the_server_with_it(br
 def test_four_bodies_are_drawn_thirty_times_a_second_in_bounded_memory(server: WebServer, opened: Any) -> None:
     """Frames are sent ten times as fast as a camera's, for as much as 20 s of them."""
     page = opened("/")
-    one = worlds()[-1]
+    one = messages_on(POSE_WORLD, 1.0)[-1]
     crowd = to_json(one) or ""
     body = crowd[crowd.index('"bodies":[') + 10 : -2]
     crowd = crowd.replace(body, ",".join([body] * 4))
@@ -214,7 +210,7 @@ def test_a_kiosk_does_not_forget_who_faces_one_camera_when_nobody_faces_another(
 
 def test_the_script_names_a_joint_that_there_is_not(server: WebServer, opened: Any) -> None:
     page = opened("/")
-    send(server, POSE_WORLD, worlds()[0])
+    send(server, POSE_WORLD, messages_on(POSE_WORLD, 1.0)[0])
     said = page.evaluate(
         """async () => {
           const { connect } = await import("/steadypose.js");

@@ -1,6 +1,7 @@
 import re
 from pathlib import Path
 from types import SimpleNamespace as Made
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,17 +70,18 @@ def test_mediapipe_bodies_stand_where_the_image_shows_them() -> None:
     travels(frame)
 
 
-def test_a_mediapipe_body_that_is_hardly_seen_is_left_out() -> None:
+def test_a_mediapipe_body_that_is_hardly_seen_is_left_out_and_points_that_are_too_few_say_so() -> None:
+    def taken(result: Made) -> PoseRaw:
+        return from_mediapipe(result, STAMP_NS, (640, 400), CAMERA.intrinsics)
+
     result = landmarker_result(standing(BLAZEPOSE33), standing(BLAZEPOSE33) + [1.0, 0.0, 0.0])
     for point in result.pose_world_landmarks[0][3:]:
         point.visibility = 0.1
-    frame = from_mediapipe(result, STAMP_NS, (640, 400), CAMERA.intrinsics)
-    assert [body.id for body in frame.bodies] == [1]
-
-
-def test_mediapipe_without_anybody() -> None:
-    nobody = Made(pose_world_landmarks=[], pose_landmarks=[])
-    assert from_mediapipe(nobody, STAMP_NS, (640, 400), CAMERA.intrinsics).bodies == []
+    assert [body.id for body in taken(result).bodies] == [1]
+    assert taken(Made(pose_world_landmarks=[], pose_landmarks=[])).bodies == []
+    del result.pose_world_landmarks[1][20:]
+    with pytest.raises(ValueError, match=r"pose_world_landmarks: expected 33 points of 3 numbers, got shape \(20, 3\)"):
+        taken(result)
 
 
 def test_a_guessed_camera_has_the_view_it_was_told() -> None:
@@ -109,9 +111,6 @@ def test_zed_skeletons_keep_ids_stamp_and_frame() -> None:
     np.testing.assert_allclose(body.confidence, np.where(np.arange(38) == 5, 0.0, 0.8), atol=1e-6)
     upright(frame)
     travels(frame)
-
-
-def test_zed_skeletons_of_another_format_say_what_to_set() -> None:
     with pytest.raises(ValueError, match=r"expected 2 \(38 key points\), got 1; set .*BODY_38"):
         from_zed(Made(header=HEADER, objects=[zed_body(np.zeros((34, 3)), body_format=1)]))
 
@@ -124,8 +123,7 @@ def test_azure_kinect_markers_are_told_apart_by_their_ids() -> None:
     joints = standing(AZURE_KINECT32)
     markers = [azure_marker(300 + i, at) for i, at in enumerate(joints)]
     markers += [azure_marker(500 + i, at + [0.0, 0.0, 1.0]) for i, at in enumerate(joints) if i != 8]
-    frame = from_azure_kinect(Made(markers=markers[::-1]))
-    assert frame is not None
+    frame: Any = from_azure_kinect(Made(markers=markers[::-1]))
     bodies = {body.id: body for body in frame.bodies}
     assert sorted(bodies) == [3, 5]
     np.testing.assert_allclose(bodies[3].positions, joints, atol=1e-6)
@@ -134,9 +132,6 @@ def test_azure_kinect_markers_are_told_apart_by_their_ids() -> None:
     assert (frame.stamp_ns, frame.frame_id) == (STAMP_NS, "their_frame")
     upright(frame)
     travels(frame)
-
-
-def test_azure_kinect_without_markers_or_with_others() -> None:
     assert from_azure_kinect(Made(markers=[])) is None
     with pytest.raises(ValueError, match=r"expected body \* 100 \+ joint, got 142"):
         from_azure_kinect(Made(markers=[azure_marker(142, np.zeros(3))]))
@@ -158,13 +153,6 @@ def test_coco_detections_are_lifted_by_depth() -> None:
     assert from_coco([], scene.depth, CAMERA.intrinsics, STAMP_NS).bodies == []
     with pytest.raises(ValueError, match="expected 17 times x, y, confidence"):
         from_coco([{"keypoints": [1.0, 2.0, 1.0]}], scene.depth, CAMERA.intrinsics, STAMP_NS)
-
-
-def test_points_that_are_too_few_say_so() -> None:
-    result = landmarker_result(standing(BLAZEPOSE33))
-    result.pose_world_landmarks[0] = result.pose_world_landmarks[0][:20]
-    with pytest.raises(ValueError, match=r"pose_world_landmarks: expected 33 points of 3 numbers, got shape \(20, 3\)"):
-        from_mediapipe(result, STAMP_NS, (640, 400), CAMERA.intrinsics)
 
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -1,11 +1,11 @@
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import VirtualClock, raw, running, until, walking
+from conftest import Given, VirtualClock, raw, running, until, walking
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -25,7 +25,6 @@ from steadypose.nodes.sources.adapters import from_pose_array
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.ros2 import CACHE_NS, TfSettings, TfSource, TransformBuffer, TransformError
-from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.body.layouts import CANONICAL, COCO17, SKELETONS
 
 PUBLISHER = """
@@ -210,8 +209,7 @@ def test_a_message_waits_for_the_transform_of_its_stamp(clock: VirtualClock, mon
     robot.queue.append(("tf", said(1_000, "odom", "base", [0, 0, 0], Rotation.identity())))
     assert next(frames) is None, "not yet: the robot has only said where it was before"
     robot.queue = [("tf", said(3_000, "odom", "base", [4, 0, 0], Rotation.identity()))]
-    found = next(frames)
-    assert found
+    found: Any = next(frames)
     assert found.calibrated
     np.testing.assert_allclose(found.sensor_pose.position, [2.0, 0, 1.5])
     np.testing.assert_allclose(
@@ -239,19 +237,3 @@ def test_a_recording_is_not_asked_of_tf(tmp_path: Any) -> None:
     settings = InputSettings(recording=str(tmp_path / "x.npz"), tf=TfSettings(fixed_frame="odom"))
     with pytest.raises(LaunchError, match="for live sources"):
         open_input(Launch(sections={"input": settings}))
-
-
-class Given(LiveSource):
-    """Gives these frames, then none."""
-
-    def __init__(self, *frames: PoseRaw | None) -> None:
-        super().__init__()
-        self._frames = frames
-
-    def frames(self) -> Generator[PoseRaw | None, None, None]:
-        yield from self._frames
-        while True:
-            yield None
-
-    def status(self) -> dict[str, str]:
-        return {}

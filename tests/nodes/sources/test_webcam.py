@@ -9,12 +9,14 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace as Made
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from conftest import VirtualClock, raw, until, walk, walking
 from scipy.spatial.transform import Rotation
+from tests.helpers.rendered_board import write_video
 
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.transport import Publisher
@@ -40,16 +42,10 @@ FRAMES = 5
 @pytest.fixture
 def video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A video of five images, each brighter than the last, in the place of camera 3."""
-    path = tmp_path / "video.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
-    for index in range(FRAMES):
-        writer.write(np.full((SIZE[1], SIZE[0], 3), (40 * index, 0, 0), np.uint8))
-    writer.release()
-    opened, video = cv2.VideoCapture, str(path)
-    cameras = {3: video, video: video}
-    monkeypatch.setattr(
-        webcam_device.cv2, "VideoCapture", lambda name: opened(cameras[name]) if name in cameras else opened()
-    )
+    path = write_video(tmp_path / "video.avi", SIZE, [(40 * index, 0, 0) for index in range(FRAMES)])
+    opened, cameras = cv2.VideoCapture, {3: str(path), str(path): str(path)}
+    opens = lambda name: opened(cameras[name]) if name in cameras else opened()  # noqa: E731
+    monkeypatch.setattr(webcam_device.cv2, "VideoCapture", opens)
     return path
 
 
@@ -174,13 +170,6 @@ def test_a_video_is_a_recording_to_clean_with_mediapipes_own_model(video: Path) 
     assert not any(frame.bodies for frame in frames), "MediaPipe sees nobody in an empty image"
 
 
-def test_a_video_that_cannot_be_read_says_so(model: str, tmp_path: Path) -> None:
-    (tmp_path / "x.mp4").write_bytes(b"no video")
-    settings = InputSettings(source="webcam", webcam=WebcamSettings(video=str(tmp_path / "x.mp4"), model=model))
-    with pytest.raises(LaunchError, match="expected a video that OpenCV can read"):
-        camera.open_webcam(settings.webcam, SourceContext(Clock(), NOT_CALIBRATED))
-
-
 def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
     told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
     guessed, lens, half = (
@@ -220,18 +209,12 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
     [
         (WebcamSettings(bodies=2), r"bodies: MediaPipe's own model finds one, got 2; .* such as https"),
         (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
+        (WebcamSettings(video="gone.mp4"), "expected a video that OpenCV can read"),
     ],
 )
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         camera.open_webcam(settings, SourceContext(Clock(), NOT_CALIBRATED))
-
-
-def test_the_launch_file_needs_no_download() -> None:
-    launch = Launch.read("webcam")
-    assert launch.settings(InputSettings).source == "webcam"
-    assert not launch.transport.lossless
-    assert launch.settings(InputSettings).webcam == WebcamSettings()
 
 
 def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
@@ -257,8 +240,7 @@ def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
     assert not list(tmp_path.glob("image*"))
     images = [image for image in shown if image]
     assert 1 < len(images) < FRAMES, "half of the frames of 30 Hz"
-    image = cv2.imdecode(np.frombuffer(images[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
+    image: Any = cv2.imdecode(np.frombuffer(images[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
     height, width = image.shape[:2]
     assert images[-1].size == (width, height)
     focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
@@ -396,8 +378,9 @@ def test_fewer_than_two_cameras_are_refused(make_launch: Callable[..., Launch], 
         PoseInputNode(launch)
 
 
-def test_the_launch_file_that_ships_reads() -> None:
-    launch = Launch.read("two_cameras")
-    assert len(launch.settings(InputSettings).merge.cameras) == 2
-    assert not launch.transport.lossless
-    assert launch.settings(PriorSettings).identify.enabled
+def test_the_launch_files_that_ship_are_of_a_camera_without_download_and_of_two_whose_people_are_told_apart() -> None:
+    one, two = Launch.read("webcam"), Launch.read("two_cameras")
+    assert one.settings(InputSettings).source == "webcam"
+    assert one.settings(InputSettings).webcam == WebcamSettings()
+    assert len(two.settings(InputSettings).merge.cameras) == 2
+    assert two.settings(PriorSettings).identify.enabled
