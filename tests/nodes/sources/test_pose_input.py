@@ -127,9 +127,7 @@ def test_what_is_waited_for(launch: Launch, clock: VirtualClock, seconds: list[i
 
 
 @pytest.mark.parametrize("lossless", ["true", "false"])
-def test_a_camera_whose_process_is_killed_is_heard_again_at_once(
-    lossless: str, make_launch: MakeLaunch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_camera_whose_process_is_killed_is_heard_again_at_once(lossless: str, make_launch, monkeypatch) -> None:
     monkeypatch.setenv(SUPERVISOR, str(os.getppid()))
     launch, frames = make_launch(nodes='["pose_input"]', transport__lossless=lossless), walk(20)
     with Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW, name="test") as subscriber:

@@ -151,7 +151,7 @@ def test_any_frame_in_any_other_is_the_product_of_matrices(seed: int, target: st
     np.testing.assert_allclose(matrix(place, Rotation.from_quat(quaternion)), expected, atol=1e-9)
 
 
-def test_between_two_stamps_it_is_interpolated_and_beyond_them_unknown() -> None:
+def test_between_two_stamps_it_is_interpolated_beyond_them_unknown_and_what_is_old_forgotten() -> None:
     buffer = TransformBuffer()
     for step in range(3):
         turned = Rotation.from_euler("z", 40 * step, degrees=True)
@@ -164,9 +164,6 @@ def test_between_two_stamps_it_is_interpolated_and_beyond_them_unknown() -> None
             buffer.lookup("odom", "base", at_ns)
     with pytest.raises(TransformError, match=r"no path from 'camera' to 'odom'.*frames heard of: base, odom"):
         buffer.lookup("odom", "camera", 1100)
-
-
-def test_it_forgets_what_is_old_and_begins_anew_where_time_does() -> None:
     buffer, none = TransformBuffer(), Rotation.identity()
     for stamp_ns in (CACHE_NS, CACHE_NS * 3 // 2, CACHE_NS * 5 // 2):
         buffer.add(said(stamp_ns, "odom", "base", [stamp_ns / 1e9, 0, 0], none), static=False)
