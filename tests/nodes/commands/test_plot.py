@@ -116,7 +116,7 @@ def test_a_body_is_compared_with_the_person_who_stands_there_while_there_is_trut
     def silence(topic: str, message: Message) -> object:
         return GONE if topic == POSE_TRUTH and 2e9 < message.stamp_ns < 3e9 else None
 
-    times = errors_of(history_of_path(recorded(tmp_path / "bag", 3.0, change=silence)), 0)[POSE_RAW].time
+    times = errors_of(history_of_path(recorded(tmp_path / "silent", 3.0, change=silence)), 0)[POSE_RAW].time
     assert not ((times > 1.1) & (times < 1.9)).any()
 
 
