@@ -18,7 +18,7 @@ def truth() -> Truth:
     return Truth.of(simulated_clips(interpolation.FRAMES, 4, 0), 15)
 
 
-def test_the_same_rotations_are_no_distance_apart_whichever_quaternion_tells_them() -> None:
+def test_the_same_rotations_are_no_distance_apart_and_npss_is_how_much_power_has_to_move() -> None:
     q = Rotation.random(30, rng=np.random.default_rng(0)).as_quat().reshape(5, 6, 4)
     assert np.allclose(quaternion_distance(-q, q), 0.0)
     other = q.copy()
@@ -26,9 +26,6 @@ def test_the_same_rotations_are_no_distance_apart_whichever_quaternion_tells_the
     found = quaternion_distance(other, q)
     nearer = min(np.linalg.norm(other[2, 3] - q[2, 3]), np.linalg.norm(other[2, 3] + q[2, 3]))
     assert np.allclose(found, np.array([0.0, 0.0, nearer, 0.0, 0.0]))
-
-
-def test_npss_is_how_much_power_has_to_move() -> None:
     t = np.arange(32) / 32
     slow, fast = (np.sin(2 * np.pi * k * t)[None, :, None] for k in (2, 5))
     assert npss(slow, slow) == 0.0

@@ -105,16 +105,13 @@ def test_messages_of_the_topics_subscribed_to_arrive_as_they_were_and_no_others(
         assert not subscriber.refused
 
 
-def test_the_last_message_arrives_though_the_publisher_is_gone(endpoint: str):
+def test_a_subscriber_may_be_first_and_outlive_its_publisher(endpoint: str, tmp_path: Path) -> None:
     with Publisher(endpoint) as publisher:
         subscriber = Subscriber(publisher.endpoint, POSE_RAW, name="test")
         assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         publisher.publish(POSE_RAW, raw())
     with subscriber:
         assert subscriber.receive(SOON_S) == (POSE_RAW, raw())
-
-
-def test_a_subscriber_may_be_first_and_outlive_its_publisher(tmp_path: Path):
     path = f"ipc://{tmp_path}/socket"
     with Subscriber(path, POSE_RAW, name="test") as subscriber:
         for start in (0, 10):

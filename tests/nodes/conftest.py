@@ -119,14 +119,15 @@ def record(directory: Path, messages: Iterable[Message | tuple[str, Message]], t
 
 
 class Given(LiveSource):
-    """Gives these frames, then none; the first once it may."""
+    """Gives these frames, then none; the first once it `may`."""
 
-    def __init__(self, *frames: PoseRaw | None, may: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, *frames: PoseRaw | None) -> None:
         super().__init__()
-        self._frames, self._may = frames, may
+        self._frames = frames
+        self.may: Callable[[], bool] = lambda: True
 
     def frames(self) -> Generator[PoseRaw | None, None, None]:
-        while not self._may():
+        while not self.may():
             yield None
         yield from self._frames
         while True:

@@ -83,7 +83,7 @@ def test_bodies_keep_their_numbers(joints: np.ndarray, first_alone: list[Poses])
     assert last.positions["head"].shape == (2, 3)
 
 
-def test_joints_by_name_or_number(first_alone: list[Poses]) -> None:
+def test_joints_by_name_or_number_also_of_many_moments(first_alone: list[Poses]) -> None:
     pose = first_alone[16]
     wrist = JOINTS.index("left_wrist")
     np.testing.assert_array_equal(pose.positions["left_wrist"], pose["positions"][wrist])
@@ -98,9 +98,6 @@ def test_joints_by_name_or_number(first_alone: list[Poses]) -> None:
         pose.positions["nose"]
     with pytest.raises(KeyError, match="the axis of joints is gone"):
         pose.positions.mean(axis=0)["head"]
-
-
-def test_of_many_moments_the_names_are_of_joints_still() -> None:
     named = ByName.of(np.arange(22 * 22 * 3.0).reshape(22, 22, 3), JOINTS, -2)
     np.testing.assert_array_equal(named["head"], np.asarray(named)[:, 15])
     assert type(named[0]) is np.ndarray

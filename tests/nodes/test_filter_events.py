@@ -118,9 +118,6 @@ def test_what_has_begun_ends_with_its_condition_or_with_the_stream() -> None:
     assert [e.kind for e in timeline.events()].count(EventKind.STANDS) == 2
     begins = [e.begin_ns for e in timeline.events()]
     assert begins == sorted(begins)
-
-
-def test_a_stream_that_starts_anew_ends_what_held() -> None:
     timeline = EventTimeline()
     for index in range(20):
         timeline.add(message(index, standing(), pointing()))

@@ -1,5 +1,6 @@
 import dataclasses
 import importlib.metadata
+import itertools
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -211,16 +212,13 @@ class Tracker(Node):
     name = "pose_input"
     frames: tuple[PoseRaw, ...] = ()
 
-    def handle(self, topic: str, message: object) -> None:
-        raise AssertionError
+    def handle(self, topic: str, message: object) -> None: ...
 
     def work(self) -> None:
-        index = 0
+        frames = itertools.cycle(self.frames)
         while not self.stopping:
-            frame = self.frames[index % len(self.frames)]
-            self.publish(POSE_RAW, dataclasses.replace(frame, stamp_ns=self.clock.now_ns()))
+            self.publish(POSE_RAW, dataclasses.replace(next(frames), stamp_ns=self.clock.now_ns()))
             self.clock.sleep(10_000_000)
-            index += 1
 
 
 @pytest.fixture

@@ -294,16 +294,15 @@ def test_a_server_that_is_late_skips_frames_and_not_bodies() -> None:
     assert server.counters["frames_skipped"] > 10
 
 
-def test_a_tracker_whose_messages_are_dropped_here_has_not_stopped(clock: VirtualClock) -> None:
+def test_a_tracker_whose_messages_are_dropped_has_not_stopped_and_streams_take_turns(
+    clock: VirtualClock,
+) -> None:
     checks = StreamChecks(PriorSettings(), 2)
     for source in ("door", "desk"):
         checks.see(dataclasses.replace(raw(0, walking(0)), source=source), clock.time_ns)
     clock.time_ns += 3 * 10**9
     checks.heard("door", clock.time_ns)
     assert {problem.cause for problem in checks.problems(clock.time_ns, live=True)} == {"desk.stopped"}
-
-
-def test_streams_are_examined_in_turn_and_none_is_left_out(clock: VirtualClock) -> None:
     checks, upside_down = StreamChecks(PriorSettings(), 10), np.array([1.0, -1.0, -1.0], np.float32)
     for k in range(45):
         clock.time_ns += FRAME_NS

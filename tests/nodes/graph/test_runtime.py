@@ -97,7 +97,7 @@ def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch:
     assert node.diagnostics().values["refused.ArithmeticError"] == "3"
 
 
-def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLaunch, clock: VirtualClock) -> None:
+def test_latency_is_from_capture_less_the_delay_and_rates_of_the_last_second(make_launch, clock: VirtualClock) -> None:
     node = Echo(make_launch(nodes='["prior"]'), clock)
     node.timeline = Timeline(START_NS, clock.time_ns, rate=2.0)
     with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
@@ -110,9 +110,6 @@ def test_latency_is_counted_from_capture_and_less_the_delay(make_launch: MakeLau
     expected = np.percentile(np.arange(1, 101) - 0.5, (50, 95, 99))  # the delay, too, passes twice as fast
     got = [float(values[f"latency_ms.p{p}"]) for p in (50, 95, 99)]
     np.testing.assert_allclose(got, expected, atol=1e-3)
-
-
-def test_rates_are_of_the_last_second(make_launch: MakeLaunch, clock: VirtualClock) -> None:
     node = Echo(make_launch(nodes='["prior"]'), clock)
     with Publisher(node.launch.transport.endpoint("prior")) as node._publisher:
         for _ in range(30):
@@ -231,7 +228,7 @@ def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Laun
     assert node._late_ns(timeline, stamp_ns) == pytest.approx(20_000_000, abs=1000)
 
 
-def test_a_message_is_sent_when_something_changes_and_once_a_second() -> None:
+def test_events_are_sent_when_something_changes_and_once_a_second_and_the_end_of_the_stream_is_passed_on() -> None:
     stream = EventStream(EventSettings())
     told = [(world.stamp_ns, stream.process(world)) for world in messages_on(POSE_WORLD, 6.0)]
     sent = [(stamp_ns, events) for stamp_ns, events in told if events]
@@ -241,9 +238,6 @@ def test_a_message_is_sent_when_something_changes_and_once_a_second() -> None:
     gaps = np.diff([stamp_ns for stamp_ns, _ in sent]) / 1e9
     assert gaps.max() < 1.05
     assert all(gap > 0.95 for gap, changes in zip(gaps, changed[1:], strict=True) if not changes)
-
-
-def test_the_end_of_the_stream_is_passed_on_and_who_comes_after_it_enters() -> None:
     stream = EventStream(EventSettings())
     first = messages_on(POSE_WORLD, 1.0)
     for world in first:

@@ -5,6 +5,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from importlib import import_module
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -318,25 +320,14 @@ def test_a_sourced_rclpy_finds_what_it_imports() -> None:
     assert {"numpy", "pyyaml"} <= set(done.stdout.split()) <= brought
 
 
-@pytest.fixture(params=["dds", "rclpy"])
+@pytest.fixture(params=["dds.DdsConnection", "rclpy_connection.RclpyConnection"])
 def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Connection]]:
     """Each way into ROS."""
-    opened: list[Connection] = []
-
-    def open_one() -> Connection:
-        if request.param == "dds":
-            from steadypose.nodes.ros2.dds import DdsConnection
-
-            opened.append(DdsConnection())
-        else:
-            from steadypose.nodes.ros2.rclpy_connection import RclpyConnection
-
-            opened.append(RclpyConnection("test"))
-        return opened[-1]
-
-    yield open_one
-    for one in opened:
-        one.close()
+    module, _, name = request.param.partition(".")
+    given = ("test",) if module.startswith("rclpy") else ()
+    with ExitStack() as opened:
+        kind = getattr(import_module(f"steadypose.nodes.ros2.{module}"), name)
+        yield lambda: opened.enter_context(closing(kind(*given)))
 
 
 def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> None:

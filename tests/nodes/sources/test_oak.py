@@ -239,9 +239,14 @@ def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Mome
     assert np.isfinite(frames[1].bodies[0].positions[5]).all()
 
 
-def test_an_archive_that_is_not_there_says_so(tmp_path: Path) -> None:
+def test_an_archive_that_is_not_there_and_a_camera_that_gives_nothing_say_so(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(LaunchError, match=r"archive: expected a file that is an NN archive"):
         open_oak(OakSettings(archive=str(tmp_path / "none.tar.xz")), CONTEXT)
+    monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
+    with dai.Pipeline(createImplicitDevice=False) as pipeline:
+        depth = pipeline.create(Player).outputs["depth"]
+        with pytest.raises(CameraError, match="no image with depth"):
+            capture(pipeline, depth, depth, None)
 
 
 def test_the_launch_file_can_be_run_without_a_camera_being_there_and_then_says_so(tmp_path: Path, monkeypatch) -> None:
@@ -280,14 +285,6 @@ def test_the_image_after_those_in_which_the_camera_settles() -> None:
     np.testing.assert_allclose(still.intrinsics, CAMERA.intrinsics)
     assert still.up is not None
     np.testing.assert_allclose(still.up, UP, atol=1e-6)
-
-
-def test_a_camera_that_gives_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
-    with dai.Pipeline(createImplicitDevice=False) as pipeline:
-        player = pipeline.create(Player)
-        with pytest.raises(CameraError, match="no image with depth"):
-            capture(pipeline, player.outputs["depth"], player.outputs["depth"], None)
 
 
 def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -132,8 +132,9 @@ def test_a_camera_whose_process_is_killed_is_heard_again_at_once(lossless: str, 
     launch, frames = make_launch(nodes='["pose_input"]', transport__lossless=lossless), walk(20)
     with Subscriber(launch.transport.endpoint("pose_input"), POSE_RAW, name="test") as subscriber:
         for of_process in (frames[:10], frames[10:]):
-            heard = lambda: "test" in node._publisher.subscribers  # noqa: B023, E731
-            node = PoseInputNode(launch, source=Given(*of_process, may=heard))
+            source = Given(*of_process)
+            node = PoseInputNode(launch, source=source)
+            source.may = lambda node=node: "test" in node._publisher.subscribers
             with running(node):  # if it is stopped, it leaves what it leaves if it is killed
                 for frame in of_process:
                     received = subscriber.receive(10)

@@ -161,6 +161,24 @@ def test_a_video_gives_every_image_at_its_own_time(video: Path, model: str) -> N
     assert not source.refused
 
 
+def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(video: Path, model: str, tmp_path: Path):
+    file, shown = tmp_path / "image", []
+    reader, settings = ImageReader(file), WebcamSettings(video=str(video), model=model)
+    for _ in VideoSource(settings, NOT_CALIBRATED, Seen().landmarker, file):
+        shown.append(reader.next())
+        assert reader.next() is None, "once"
+        assert file.stat().st_mode & 0o077 == 0, "of this user alone"
+    assert not list(tmp_path.glob("image*"))
+    images = [image for image in shown if image]
+    assert 1 < len(images) < FRAMES, "half of the frames of 30 Hz"
+    image: Any = cv2.imdecode(np.frombuffer(images[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
+    height, width = image.shape[:2]
+    assert images[-1].size == (width, height)
+    focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
+    np.testing.assert_allclose(images[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
+    assert [image.stamp_ns for image in images] == sorted({image.stamp_ns for image in images})
+
+
 def test_a_video_is_a_recording_to_clean_with_mediapipes_own_model(video: Path) -> None:
     pytest.importorskip("mediapipe.python.solutions", reason="no MediaPipe with a model of its own")
     source = open_recording(video)
@@ -224,28 +242,6 @@ def test_mediapipe_itself_refuses_a_file_that_is_no_model(model: str) -> None:
         webcam_device.mediapipe_landmarker(WebcamSettings(model=model)),
     ):
         pass
-
-
-def test_the_newest_image_is_kept_for_the_viewer_and_none_is_left_behind(
-    video: Path, model: str, tmp_path: Path
-) -> None:
-    file = tmp_path / "image"
-    reader = ImageReader(file)
-    settings = WebcamSettings(video=str(video), model=model)
-    shown = []
-    for _ in VideoSource(settings, NOT_CALIBRATED, Seen().landmarker, file):
-        shown.append(reader.next())
-        assert reader.next() is None, "once"
-        assert file.stat().st_mode & 0o077 == 0, "of this user alone"
-    assert not list(tmp_path.glob("image*"))
-    images = [image for image in shown if image]
-    assert 1 < len(images) < FRAMES, "half of the frames of 30 Hz"
-    image: Any = cv2.imdecode(np.frombuffer(images[-1].jpeg, np.uint8), cv2.IMREAD_COLOR)
-    height, width = image.shape[:2]
-    assert images[-1].size == (width, height)
-    focal = width / 2 / np.tan(WebcamSettings.field_of_view / 2)
-    np.testing.assert_allclose(images[-1].intrinsics[[0, 1], [0, 1]], focal, rtol=0.01)
-    assert [image.stamp_ns for image in images] == sorted({image.stamp_ns for image in images})
 
 
 class Flickering:
