@@ -6,6 +6,7 @@ One recording is cleaned here, for `clean` and for each process of a folder's.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import shutil
 import time
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import IO, Annotated, Any
 
 import numpy as np
 import tyro
@@ -106,11 +107,13 @@ def unfinished(out: Path) -> Iterator[Path]:
     has its name.
 
     Raises:
-        LaunchError: the folder cannot be written to, or the disk is full.
+        LaunchError: the folder cannot be written to, or the disk is full, or another call is writing ``out``.
     """
     folder = out.with_name(f".{out.name}.part")
     mark = folder / ".steadypose"
     if mark.exists():
+        with mark.open() as held:
+            _lock(held, out)
         shutil.rmtree(folder)  # of a call that was killed
     try:
         folder.mkdir(parents=True)
@@ -119,15 +122,28 @@ def unfinished(out: Path) -> Iterator[Path]:
     except OSError as error:
         raise LaunchError(f"{out}: expected a folder that can be written to, got one that cannot: {error}") from error
     try:
-        mark.touch()
-        yield folder / out.name
-        (folder / out.name).replace(out)
+        with mark.open("w") as held:
+            _lock(held, out)
+            yield folder / out.name
+            (folder / out.name).replace(out)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         raise LaunchError(f"{out}: {os.strerror(error.errno)}; make room, or write it elsewhere") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _lock(held: IO[str], out: Path) -> None:
+    """Lock the mark of a folder for this process, until the file is closed."""
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise LaunchError(
+            f"{out}: another steadypose is writing it: wait until it has ended, or write elsewhere"
+        ) from error
+    except OSError:
+        pass  # a file system without locks
 
 
 def write_output(

@@ -14,6 +14,7 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState, Pose, PoseClean, PoseWorld
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.info import info
+from steadypose.nodes.commands.output import unfinished
 from steadypose.nodes.commands.small import repair
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
@@ -55,6 +56,20 @@ def test_a_single_frame_is_counted_as_one_and_what_was_not_used_is_said(tmp_path
     far[20, J["left_wrist"]] += 1.0
     assert clean(write_npz(tmp_path / "far.npz", far), tmp_path / "near.npz") == 0
     assert "  not used as given: joints too far (1), joints refused (1)\n" in capsys.readouterr().err
+
+
+def test_a_second_call_does_not_write_into_the_first_ones_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out.npz"
+    with unfinished(out) as part:
+        part.write_text("of the first")
+        with pytest.raises(LaunchError, match="another steadypose is writing it"), unfinished(out):
+            pass
+    assert out.read_text() == "of the first"
+    (tmp_path / ".out.npz.part").mkdir()
+    (tmp_path / ".out.npz.part" / ".steadypose").touch()  # of a call that was killed
+    with unfinished(out) as part:
+        part.write_text("of the second")
+    assert out.read_text() == "of the second"
 
 
 def test_jittered_stamps_come_back_as_they_were(tmp_path: Path) -> None:
