@@ -84,8 +84,8 @@ def check_back(back_ns: int) -> Iterator[Problem]:
         yield warning(
             "stamps_back",
             f"stamps go back by {back_ns / SECOND_NS:.1f} s, so the stream starts anew there, and where the times "
-            "before and after overlap, the poses of both are mixed: expected increasing stamps; cut the recording "
-            "there, and clean its parts one by one",
+            "before and after overlap, the poses of both are mixed: expected increasing stamps; sort a file's rows by "
+            "stamp, or, if the clock was set, cut the recording there and clean its parts one by one",
         )
 
 
