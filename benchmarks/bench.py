@@ -5,6 +5,7 @@ The search is the same for every baseline: the same number of evaluations, the s
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -18,8 +19,8 @@ from scipy.stats import qmc
 from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines import recurrent, smoothnet
 from steadypose.benchmarks.baselines.filters import BASELINES, Baseline
-from steadypose.benchmarks.metrics import errors_mm
 from steadypose.benchmarks.motion import MotionClips, prepared_clips, simulated_clips
+from steadypose.benchmarks.scores import errors_mm
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.settings import PriorSettings
 
@@ -252,3 +253,31 @@ def _averaged(group: Sequence[dict[str, Any]]) -> dict[str, Any]:
         else value
         for name, value in group[0].items()
     } | {"seeds": len(group)}
+
+
+ROUNDS = 50
+SIZE = 44
+"""Number of states of a whole body along one axis: positions and velocities of 22 joints."""
+STEPS = 30
+
+
+def numpy_ms() -> float:
+    """Run 30 steps of a Kalman filter of 44 states `ROUNDS` times, and return the least time.
+
+    The workload contains no code of this product. Times are the thread's processor time, milliseconds.
+    """
+    rng = np.random.default_rng(0)
+    transition = np.eye(SIZE) + np.eye(SIZE, k=SIZE // 2) / 30
+    process = np.cov(rng.standard_normal((SIZE, 4 * SIZE)))
+    seen = rng.standard_normal((STEPS, SIZE // 2))
+    took = []
+    for _ in range(ROUNDS):
+        state, covariance = np.zeros(SIZE), np.eye(SIZE)
+        began = time.thread_time()
+        for measured in seen:
+            state, covariance = transition @ state, transition @ covariance @ transition.T + process
+            gain = np.linalg.solve(covariance[: SIZE // 2, : SIZE // 2] + np.eye(SIZE // 2), covariance[: SIZE // 2]).T
+            state = state + gain @ (measured - state[: SIZE // 2])
+            covariance = covariance - gain @ covariance[: SIZE // 2]
+        took.append(time.thread_time() - began)
+    return 1e3 * min(took)

@@ -53,9 +53,7 @@ COMPLETE = "complete"
 _WEIGHT_SETS = ("default", "kinect_v2")
 """Weight sets that ship; others may be installed beside them."""
 
-_PLUMBING = tuple(
-    f"benchmarks.{name}" for name in ("evaluate", "figures", "output", "provenance", "report", "results", "stale")
-)
+_PLUMBING = tuple(f"benchmarks.{name}" for name in ("evaluate", "figures", "output", "provenance", "report", "results"))
 """Modules that change no figure."""
 
 SAME_M = 1e-4

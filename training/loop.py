@@ -23,8 +23,8 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, LRScheduler
 
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
+from steadypose.training.data.prepare import whole
 from steadypose.training.distributed import average_gradients, from_first, processes, rank, share, writes
-from steadypose.training.files import whole
 from steadypose.training.weights import save_weights, started
 
 Network = TypeVar("Network", bound=nn.Module)

@@ -16,8 +16,8 @@ from torch import nn
 from steadypose.prior.fit.tensors import load_tensors
 from steadypose.prior.models import weights as weights_io
 from steadypose.prior.models.weights import Arrays, WeightsError
+from steadypose.training.data.prepare import whole
 from steadypose.training.distributed import writes
-from steadypose.training.files import whole
 
 
 def save_weights(path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, Any]) -> None:

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from steadypose.benchmarks.baselines.banks import bank, whole_body_bank
 from steadypose.benchmarks.baselines.body import beside
-from steadypose.benchmarks.baselines.kalman import fixed_lag, smooth
+from steadypose.benchmarks.baselines.kalman import bank, fixed_lag, smooth, whole_body_bank
 from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS

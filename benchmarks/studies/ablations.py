@@ -22,17 +22,15 @@ import numpy as np
 
 from steadypose.benchmarks import product
 from steadypose.benchmarks.baselines.filters import missing
-from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.corruption import correlated
+from steadypose.benchmarks.bench import Bench, numpy_ms
+from steadypose.benchmarks.corruption import BEGINS, FAULTS, FAULTS_IN_DEPTH, correlated
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.provenance import VARIANTS_22, WORLD_22
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.scores import interval, ratio, score
 from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
-from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, FAULTS_IN_DEPTH
 from steadypose.benchmarks.studies.world import chain, measure
-from steadypose.benchmarks.workload import numpy_ms
 from steadypose.prior.arrays import Floats
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import (

@@ -18,11 +18,10 @@ import torch
 from steadypose.benchmarks.baselines.body import ConditionalGaussian
 from steadypose.benchmarks.baselines.inbetween import NearestPose
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.metrics import procrustes
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.scores import ratio
+from steadypose.benchmarks.scores import procrustes, ratio
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints
 from steadypose.prior.body.kinematics import heading, rotation_matrices, yaw_matrix

@@ -21,10 +21,18 @@ from steadypose.benchmarks.bench import (
     tune_on,
     tuning_log,
 )
-from steadypose.benchmarks.metrics import position_error, reliability, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.results import Table
-from steadypose.benchmarks.scores import Scores, figures, pivot, score, source_table
+from steadypose.benchmarks.scores import (
+    Scores,
+    figures,
+    pivot,
+    position_error,
+    reliability,
+    score,
+    sigma_ratio,
+    source_table,
+)
 from steadypose.prior.arrays import Floats
 
 Condition = Callable[[Floats, np.random.Generator], Floats]

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from steadypose.benchmarks.baselines.banks import whole_body_bank
 from steadypose.benchmarks.baselines.body import facing
+from steadypose.benchmarks.baselines.kalman import whole_body_bank
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.metrics import sigma_ratio
 from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import NONE, Result, Table
+from steadypose.benchmarks.scores import sigma_ratio
 from steadypose.benchmarks.systems.event_scenes import LEG
 from steadypose.benchmarks.systems.events import CAMERA, simulated, worlds_of
 from steadypose.msgs.types import EventKind, Phase, PoseRaw, PoseWorld, RawBody

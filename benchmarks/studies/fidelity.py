@@ -17,12 +17,19 @@ from steadypose.benchmarks import figures as pictures
 from steadypose.benchmarks.baselines.filters import FILTERS
 from steadypose.benchmarks.bench import TUNED_ON, Answer, Bench, Methods, answers, tune_on, tuning_log
 from steadypose.benchmarks.corruption import along_sight, gaussian
-from steadypose.benchmarks.metrics import acceleration_error, errors_mm, mean_mm, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import CLEAN_22
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.scores import pivot, source_table
+from steadypose.benchmarks.scores import (
+    acceleration_error,
+    errors_mm,
+    mean_mm,
+    pivot,
+    position_error,
+    sigma_ratio,
+    source_table,
+)
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.timing.rate import FPS

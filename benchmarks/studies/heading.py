@@ -29,7 +29,7 @@ from steadypose.prior.body.skeleton import HIPS, SHOULDERS
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.rate import FPS
-from steadypose.training.data.ui_prmd import VALIDATION_SUBJECTS, load_pairs
+from steadypose.training.data.readers import VALIDATION_SUBJECTS, load_pairs
 
 DEPENDS_ON = VARIANTS
 

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from sklearn.metrics import roc_auc_score, roc_curve
 
 from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.corruption import FAULTS, HELD, held
 from steadypose.benchmarks.motion import as_set, digest, prepared_set
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.studies.hgvae_faults import FAULTS, HELD, held
 from steadypose.benchmarks.studies.hgvae_imputation import sweep, whole_joints
 from steadypose.prior.arrays import Floats
 from steadypose.prior.fit.tensors import load_network

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.benchmarks import figures
-from steadypose.benchmarks.baselines.banks import whole_body_bank
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import BASELINES, Baseline
-from steadypose.benchmarks.baselines.kalman import whole_body_kalman
+from steadypose.benchmarks.baselines.kalman import whole_body_bank, whole_body_kalman
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import arm_behind, below, bursts, gaussian, hide
 from steadypose.benchmarks.product import PRODUCT

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from steadypose.benchmarks import product
-from steadypose.benchmarks.baselines.banks import bank
+from steadypose.benchmarks.baselines.kalman import bank
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import below, gaussian, hide
 from steadypose.benchmarks.motion import MotionClips, as_set, digest, prepared_set

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks import product
 from steadypose.benchmarks.depth_camera import Stereo, corrupt, render
-from steadypose.benchmarks.metrics import acceleration_error, position_error
 from steadypose.benchmarks.motion import MotionClips
+from steadypose.benchmarks.scores import acceleration_error, position_error
 from steadypose.nodes.driving import clean_joints
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import LOAD_SPEED, REST_HEIGHT, label_contacts, rotation_matrices

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from steadypose.benchmarks.baselines import inbetween
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.metrics import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.motion import MotionClips, as_set, prepared_set
 from steadypose.benchmarks.provenance import COMPLETE
 from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.scores import contact_speed, npss, quaternion_distance
 from steadypose.benchmarks.studies.interpolation_noise import in_noise
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.inverse_kinematics import place_joints

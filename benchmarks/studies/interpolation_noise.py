@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from steadypose.benchmarks.baselines.banks import whole_body_bank
+from steadypose.benchmarks.baselines.kalman import whole_body_bank
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.corruption import correlated, gaussian
 from steadypose.benchmarks.results import Table

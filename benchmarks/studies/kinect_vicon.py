@@ -27,15 +27,20 @@ import numpy as np
 from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines.filters import OFFLINE
 from steadypose.benchmarks.bench import Bench, over_seeds, tuning_log
-from steadypose.benchmarks.metrics import position_error, reliability
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.studies.kinect_clips import (
+from steadypose.benchmarks.scores import position_error, reliability
+from steadypose.benchmarks.studies.kinect_methods import (
+    KNOWN,
     OUT_OF_STEP,
     SCORED,
     SUBJECTS,
+    UNKNOWN,
     Clip,
+    Kinect,
+    Method,
     Scores,
+    Stated,
     align,
     deviation,
     learn_offset,
@@ -44,7 +49,6 @@ from steadypose.benchmarks.studies.kinect_clips import (
     score,
     summary,
 )
-from steadypose.benchmarks.studies.kinect_methods import KNOWN, UNKNOWN, Kinect, Method, Stated
 from steadypose.prior.arrays import Floats
 from steadypose.prior.timing.rate import FPS
 

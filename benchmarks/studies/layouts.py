@@ -13,11 +13,11 @@ import numpy as np
 
 from steadypose.benchmarks.baselines.body import ConditionalGaussian
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.metrics import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.benchmarks.product import run as clean
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result, Table
+from steadypose.benchmarks.scores import acceleration_error, position_error, sigma_ratio
 from steadypose.benchmarks.studies.hidden_joints import given_the_seen
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.capsules import mount, stature

@@ -16,12 +16,11 @@ import numpy as np
 
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Answer, Bench, Methods, answers, tune, tuning_log
-from steadypose.benchmarks.metrics import errors_mm
 from steadypose.benchmarks.motion import side_by_side
 from steadypose.benchmarks.product import PRODUCT
 from steadypose.benchmarks.provenance import CLEAN
 from steadypose.benchmarks.results import Result
-from steadypose.benchmarks.scores import pivot
+from steadypose.benchmarks.scores import errors_mm, pivot
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import BLAZEPOSE33, to_canonical

@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.bench import Bench, numpy_ms
 from steadypose.benchmarks.provenance import ROOT, WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.systems.running import START_S, running
-from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.recording import RecordingReader, RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import Diagnostics, PoseRaw, RawBody

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.bench import Bench, numpy_ms
 from steadypose.benchmarks.provenance import ROOT, WORLD
 from steadypose.benchmarks.results import Result, Table
-from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseWorld
 from steadypose.nodes.driving import OfflineRun

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from steadypose.benchmarks.bench import Bench
+from steadypose.benchmarks.bench import Bench, numpy_ms
 from steadypose.benchmarks.provenance import WORLD
 from steadypose.benchmarks.results import Result, Table
 from steadypose.benchmarks.systems.latency import (
@@ -31,7 +31,6 @@ from steadypose.benchmarks.systems.latency import (
     recorded,
 )
 from steadypose.benchmarks.systems.running import START_S, Running, running_nodes
-from steadypose.benchmarks.workload import numpy_ms
 from steadypose.msgs.topics import POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import Message, PoseRaw

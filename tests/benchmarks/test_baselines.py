@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 
 from steadypose.benchmarks.baselines import filters
-from steadypose.benchmarks.baselines.banks import bank, noise_found, whole_body_bank
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import BASELINES, FILTERS, OFFLINE, interpolate, one_euro
-from steadypose.benchmarks.baselines.kalman import fixed_lag, process_noise, transition
+from steadypose.benchmarks.baselines.kalman import (
+    bank,
+    fixed_lag,
+    noise_found,
+    process_noise,
+    transition,
+    whole_body_bank,
+)
 from steadypose.benchmarks.studies.hidden_joints import given_the_seen
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J

@@ -11,10 +11,9 @@ from steadypose.benchmarks.baselines import smoothnet
 from steadypose.benchmarks.baselines.filters import Baseline
 from steadypose.benchmarks.bench import Bench, over_seeds, search
 from steadypose.benchmarks.corruption import gaussian
-from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.motion import MotionClips, simulated_clips
 from steadypose.benchmarks.scores import figures as figures_of
-from steadypose.benchmarks.scores import pivot, score
+from steadypose.benchmarks.scores import pivot, position_error, score
 from steadypose.benchmarks.studies.corrupted import calibration_table, reliability_bins, run_conditions
 from steadypose.prior.body.skeleton import J
 

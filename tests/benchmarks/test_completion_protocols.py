@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.benchmarks.baselines import inbetween
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.metrics import npss, quaternion_distance
 from steadypose.benchmarks.motion import as_set, simulated_clips
+from steadypose.benchmarks.scores import npss, quaternion_distance
 from steadypose.benchmarks.studies import completion, interpolation, interpolation_noise
 from steadypose.benchmarks.studies.interpolation import BEFORE, Truth, measure, relate
 

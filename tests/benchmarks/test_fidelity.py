@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from rich.progress import Progress
 
 from steadypose.benchmarks import product
-from steadypose.benchmarks.baselines.banks import bank, whole_body_bank
 from steadypose.benchmarks.baselines.filters import Baseline, raw
+from steadypose.benchmarks.baselines.kalman import bank, whole_body_bank
 from steadypose.benchmarks.bench import Answer, Bench, Methods
 from steadypose.benchmarks.corruption import along_sight
 from steadypose.benchmarks.motion import spread

@@ -3,8 +3,8 @@ import pytest
 import torch
 from tests.helpers.bodies import waving
 
+from steadypose.benchmarks.corruption import BEGINS, FAULTS, FAULTS_IN_DEPTH, MIN_MOTION
 from steadypose.benchmarks.studies import hgvae_imputation as imputation
-from steadypose.benchmarks.studies.hgvae_faults import BEGINS, FAULTS, FAULTS_IN_DEPTH, MIN_MOTION
 from steadypose.prior.body.skeleton import MIRROR, REST_OFFSETS, J
 from steadypose.prior.models.hgvae.config import JOINT_NODES, HGVAEConfig, Level
 from steadypose.prior.models.hgvae.features import in_frame_of, to_tracks

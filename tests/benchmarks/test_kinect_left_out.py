@@ -17,16 +17,31 @@ from rich.progress import Progress
 
 from steadypose.benchmarks.baselines.filters import FILTERS, OFFLINE
 from steadypose.benchmarks.bench import Bench, Tuned
-from steadypose.benchmarks.metrics import position_error
 from steadypose.benchmarks.results import Result
-from steadypose.benchmarks.scores import interval
+from steadypose.benchmarks.scores import interval, position_error
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
-from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, Scores, align, deviation, learn_offset, move, score
-from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Kinect, Method, Stated, run_ours
+from steadypose.benchmarks.studies.kinect_methods import (
+    KNOWN,
+    RIDGE,
+    SCORED,
+    TCN,
+    UNKNOWN,
+    Clip,
+    Kinect,
+    Method,
+    Scores,
+    Stated,
+    align,
+    deviation,
+    learn_offset,
+    move,
+    run_ours,
+    score,
+)
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.settings import PriorSettings
-from steadypose.training.data.ui_prmd import KinectPair
+from steadypose.training.data.readers import KinectPair
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes import sensor_bias
 from steadypose.training.recipes.sensor_bias import SensorTake, leave_one_person_out

@@ -11,8 +11,8 @@ from steadypose.benchmarks.baselines.kinect_regression import (
     ridge,
     temporal_convolution,
 )
-from steadypose.benchmarks.metrics import position_error
-from steadypose.benchmarks.studies.kinect_clips import OTHER_SIDE, SCORED
+from steadypose.benchmarks.scores import position_error
+from steadypose.benchmarks.studies.kinect_methods import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J

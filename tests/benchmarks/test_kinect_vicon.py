@@ -11,12 +11,22 @@ from scipy.stats import spearmanr
 
 from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
 from steadypose.benchmarks.bench import Bench, Tuned
-from steadypose.benchmarks.studies import kinect_clips, kinect_methods
-from steadypose.benchmarks.studies.kinect_clips import SCORED, Clip, align, deviation, learn_offset, score
-from steadypose.benchmarks.studies.kinect_methods import Kinect, Stated, best_without, run_filter
+from steadypose.benchmarks.studies import kinect_methods
+from steadypose.benchmarks.studies.kinect_methods import (
+    SCORED,
+    Clip,
+    Kinect,
+    Stated,
+    align,
+    best_without,
+    deviation,
+    learn_offset,
+    run_filter,
+    score,
+)
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
-from steadypose.training.data.ui_prmd import KinectPair
+from steadypose.training.data.readers import KinectPair
 from steadypose.training.loop import TrainingOptions
 
 REST = np.array(
@@ -145,7 +155,7 @@ def test_a_search_has_each_persons_figures_and_their_mean(monkeypatch: pytest.Mo
     found: dict = kinect.tuned(clips)
     own = {who: [c for c in clips if c.subject == who] for who in ("s07", "s08")}
     for name in ("position_mm", "acceleration_mm"):
-        each = [kinect_clips.quick_score(some, [c.raw + 1.0 for c in some])[name] for some in own.values()]
+        each = [kinect_methods.quick_score(some, [c.raw + 1.0 for c in some])[name] for some in own.values()]
         assert [found[f"s07 {name}"], found[f"s08 {name}"]] == pytest.approx(each)
         assert found[name] == pytest.approx(np.mean(each), abs=1e-3)
 
@@ -193,8 +203,8 @@ def test_every_nth_clip_of_each_person_is_read(monkeypatch) -> None:
         KinectPair(f"{who} {take}", who, "m01", 30.0, *rng.normal(size=(2, 5, 22, 3)))
         for who in ("s01", "s02") for take in range(5)
     ]  # fmt: skip
-    monkeypatch.setattr(kinect_clips, "load_pairs", lambda path, who: [pair for pair in pairs if pair.subject in who])
-    found = kinect_clips.read_clips(Path("pairs.npz"), ("s02", "s01"), 3)
+    monkeypatch.setattr(kinect_methods, "load_pairs", lambda path, who: [pair for pair in pairs if pair.subject in who])
+    found = kinect_methods.read_clips(Path("pairs.npz"), ("s02", "s01"), 3)
     assert [one.name for one in found] == ["s02 0", "s02 3", "s01 0", "s01 3"]
     assert [one.subject for one in found] == ["s02", "s02", "s01", "s01"]
     pair, one, wrist = pairs[3], found[3], SCORED.index("left_wrist")

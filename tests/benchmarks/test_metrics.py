@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks import metrics
-from steadypose.benchmarks.metrics import position_error, procrustes, sigma_ratio
-from steadypose.benchmarks.scores import interval, people_means, ratio
+from steadypose.benchmarks import scores
+from steadypose.benchmarks.scores import interval, people_means, position_error, procrustes, ratio, sigma_ratio
 from steadypose.prior.body.kinematics import rigid_alignment
 from steadypose.training.data.recordings import trunk_frame
 
@@ -24,7 +23,7 @@ def test_errors_against_loops() -> None:
         for j in range(a.shape[1]):
             bend = [x[t + 1, j] - 2 * x[t, j] + x[t - 1, j] for x in (a, b)]
             np.testing.assert_allclose(
-                metrics.acceleration_error(a, b)[t - 1, j], np.linalg.norm(bend[0] - bend[1]), atol=1e-12
+                scores.acceleration_error(a, b)[t - 1, j], np.linalg.norm(bend[0] - bend[1]), atol=1e-12
             )
 
 
@@ -32,13 +31,13 @@ def test_length_variation_of_a_known_bone_and_horizontal_speed_of_each_foot() ->
     positions = np.zeros((4, 3, 3))
     positions[:, 1, 0] = [0.9, 1.1, 0.9, 1.1]
     positions[:, 2, 1] = 0.5
-    assert metrics.length_variation(positions, [(0, 1)]) == pytest.approx(0.1)
-    assert metrics.length_variation(positions, [(0, 1), (0, 2)]) == pytest.approx(0.05)
+    assert scores.length_variation(positions, [(0, 1)]) == pytest.approx(0.1)
+    assert scores.length_variation(positions, [(0, 1), (0, 2)]) == pytest.approx(0.05)
     positions = np.zeros((4, 2, 3))
     positions[:, 0, 0] = [0.0, 0.01, 0.03, 0.03]
     positions[:, :, 2] = np.arange(4)[:, None]
     contact = np.array([[True, True], [True, False], [True, True], [False, True]])
-    speed = metrics.contact_speed(positions, contact, np.array([0.0, 0.1, 0.3, 0.4]))
+    speed = scores.contact_speed(positions, contact, np.array([0.0, 0.1, 0.3, 0.4]))
     np.testing.assert_allclose(speed[:, 0], [0.1, 0.1, np.nan])
     np.testing.assert_allclose(speed[:, 1], [np.nan, np.nan, 0.0])
 
@@ -86,7 +85,7 @@ def test_stated_and_found_deviations() -> None:
     assert sigma_ratio(error, sigma) == pytest.approx(1.0, rel=0.02)
     assert sigma_ratio(2 * error, sigma) == pytest.approx(2.0, rel=0.02)
     sigma[:100], error[100:200] = np.inf, np.nan
-    bins = metrics.reliability(error, sigma, bins=5)
+    bins = scores.reliability(error, sigma, bins=5)
     assert sum(count for *_, count in bins) == 19_800
     for stated, found, _ in bins:
         assert found == pytest.approx(stated, rel=0.05)

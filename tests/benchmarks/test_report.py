@@ -10,9 +10,8 @@ from rich.console import Console
 
 from steadypose.benchmarks import output, provenance
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, measured, ships, stale
-from steadypose.benchmarks.report import ERRORS, Args, fill, main, overview, page, ratios
+from steadypose.benchmarks.report import ERRORS, STALE, Args, fill, main, overview, page, ratios
 from steadypose.benchmarks.results import PICTURES, Table, load, save, show
-from steadypose.benchmarks.stale import STALE
 from steadypose.benchmarks.studies import STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
 

@@ -10,7 +10,7 @@ from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.sensor_bias import FEATURES, HISTORY, LiveCorrection, features, trunk_frame
-from steadypose.training.data.ui_prmd import KinectPair
+from steadypose.training.data.readers import KinectPair
 from steadypose.training.loop import TrainingOptions
 from steadypose.training.recipes import sensor_bias
 from steadypose.training.recipes.sensor_bias import SensorTake, train_correction, train_sensor

@@ -17,16 +17,18 @@ from steadypose.prior.mocap.bvh import CMU_BVH, Bvh
 from steadypose.prior.mocap.clip import TO_Z_UP, Clip, MotionError
 from steadypose.training.data.cmu import CMU_AMC, read_expmap
 from steadypose.training.data.readers import (
+    TRAIN_SUBJECTS,
     UNREADABLE,
+    VALIDATION_SUBJECTS,
     Dropped,
     Progress,
     amc_motions,
     bvh_motion,
+    load_pairs,
     members,
     read_own,
     stem_of,
 )
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 CMU_LICENCE = "CMU mocap: free, no resale"
 """Licence of CMU's data: free for all uses including products; the data may not be resold; acknowledge NSF

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,6 @@ from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import Split, Use
 from steadypose.training.data.readers import Dropped
-from steadypose.training.files import whole
 
 CUTOFF = 12.0
 """Cut-off frequency of the anti-aliasing filter before resampling to 30 Hz, Hz."""
@@ -112,8 +113,7 @@ def prepare_clip(clip: Clip, weights: Use, split: Split, speed: float = 1.0) -> 
         if fault:
             yield Dropped(clip.name, clip.source, "cut: impossible motion", fault)
         for first, last in runs(~bad):
-            whole = complete.all() and not fault
-            name = clip.name if whole else f"{clip.name}@{start / clip.fps + first / FPS:.1f}s"
+            name = clip.name if complete.all() and not fault else f"{clip.name}@{start / clip.fps + first / FPS:.1f}s"
             if (last - first) / FPS < MIN_SECONDS:
                 yield _too_short(name, clip.source, (last - first) / FPS)
             else:
@@ -254,6 +254,24 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
     for text in ("name", "source", "licence", "subject", "action"):
         arrays[text] = np.array([getattr(p.clip, text) for p in prepared])
     save_arrays(path, **arrays)
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that is ``path`` after the block. If it cannot be written, what was there before stays.
+
+    Raises:
+        OSError: it cannot be written, for example because the disk is full.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            yield file
+        part.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, os.strerror(error.errno or 0), str(path)) from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def save_arrays(path: Path, **arrays: NDArray[Any]) -> None:

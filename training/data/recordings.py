@@ -19,7 +19,7 @@ from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import DATA_SETS
 from steadypose.training.data.prepare import fill_gaps, find_faults, resample, runs, save_arrays
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
+from steadypose.training.data.readers import TRAIN_SUBJECTS, VALIDATION_SUBJECTS, load_pairs
 
 SPEEDS = (1.0, 1.4, 1.9, 2.5)
 """Factors by which training motion is sped up: people of the test split move faster than those recorded for

@@ -51,7 +51,7 @@ from steadypose.training.data.dataset import (
     mirror_rotations,
 )
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
-from steadypose.training.networks.attention import AttentionLayer
+from steadypose.training.networks.graph import AttentionLayer
 from steadypose.training.weights import arrays_of
 
 

@@ -37,7 +37,7 @@ from steadypose.prior.models.sensor_bias import (
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import mirror_offsets
-from steadypose.training.data.ui_prmd import TRAIN_SUBJECTS, KinectPair, load_pairs
+from steadypose.training.data.readers import TRAIN_SUBJECTS, KinectPair, load_pairs
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
 

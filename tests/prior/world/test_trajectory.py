@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from steadypose.benchmarks.studies.root_drift import SEEN_FRAMES, Clip, evaluate_fusion, observe
+from steadypose.benchmarks.studies.world import SEEN_FRAMES, Clip, evaluate_fusion, observe
 from steadypose.msgs.types import CONTACTS, JOINTS, Pose, PoseClean, PoseWorld, Tracking
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J, limbs

@@ -7,7 +7,7 @@ from tests.training.data.test_motion_plug_in_gait import BENDS, HIP, STILL, reco
 from steadypose.prior.body.layouts import KINECT22
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.clip import MotionError
-from steadypose.training.data.ui_prmd import load_pairs
+from steadypose.training.data.readers import load_pairs
 
 MARKERS = recording(BENDS, STILL, np.zeros(3))
 
