@@ -29,8 +29,6 @@ Parameters = dict[str, float]
 
 @dataclass(frozen=True)
 class Tuned:
-    """Result of a parameter search."""
-
     parameters: Parameters
     """parameters with the least loss"""
     tried: list[dict[str, float]]
@@ -80,8 +78,6 @@ RECURRENT = "GRU of the whole body"
 
 @dataclass(frozen=True)
 class Bench:
-    """Settings of a study."""
-
     quick: bool
     """use fewer clips, points and steps, to check that everything works"""
     mocap: Path | None
@@ -121,7 +117,6 @@ class Bench:
 
     @cached_property
     def smoothnets(self) -> list[smoothnet.SmoothNet]:
-        """Train a network for each seed."""
         motion = self.training_clips()
         steps = 100 if self.quick else 3000
         return [
@@ -131,7 +126,6 @@ class Bench:
 
     @cached_property
     def recurrent(self) -> recurrent.RecurrentDenoiser:
-        """Train the whole-body denoiser."""
         track = partial(self.progress.track, description="recurrent denoiser")
         return recurrent.train(self.training_clips(), self.delays, 50 if self.quick else 3000, 0, track)
 
@@ -148,8 +142,6 @@ class Answer(NamedTuple):
 
 
 class Methods(NamedTuple):
-    """Methods to compare."""
-
     baselines: Sequence[Baseline]
     """baselines without training"""
     product: Mapping[str, PriorSettings]

@@ -105,7 +105,6 @@ def bursts(shape: tuple[int, int, int], frames: int, first: int, rng: np.random.
 
 
 def hide(seen: Floats, hidden: Mask) -> Floats:
-    """Set hidden joints to NaN."""
     return np.where(hidden[..., None], np.nan, seen)
 
 
@@ -128,7 +127,6 @@ def _all(windows: Floats) -> NDArray[np.bool_]:
 
 
 def noise(windows: Floats, rng: np.random.Generator, sigma: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Add independent noise along each axis."""
     return windows + rng.normal(0.0, sigma, windows.shape), _all(windows)
 
 

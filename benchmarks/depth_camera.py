@@ -21,17 +21,9 @@ from steadypose.prior.body.skeleton import J
 
 @dataclass(frozen=True)
 class Stereo:
-    """A depth camera and its errors.
-
-    Attributes:
-        width, height: size of the depth image, pixels.
-        focal: focal length, pixels.
-        baseline: distance between the two cameras, metres.
-        noise: standard deviation of disparity, pixels.
-        step: quantisation of disparity, pixels.
-        window: side of the matcher's window, pixels.
-        holes: share of the image without a match.
-    """
+    """A depth camera and its errors, in pixels: size of the image, focal length, standard deviation and quantisation
+    of disparity, side of the matcher's window; ``baseline`` is the distance between the two cameras, metres, ``holes``
+    the share of the image without a match."""
 
     width: int = 640
     height: int = 400

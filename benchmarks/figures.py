@@ -69,12 +69,7 @@ def curves(
 
 def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: str) -> Figure:
     """Plot the error over the predicted standard deviation, both root mean squares along an axis. The diagonal is
-    calibrated.
-
-    Args:
-        bins: (predicted, observed, count) by group, metres.
-        title: title of the plot.
-    """
+    calibrated. ``bins`` are (predicted, observed, count) by group, metres."""
     figure = Figure(figsize=(7.0, 4.4), layout="constrained")
     axis = figure.subplots()
     values = [v * 100 for rows in bins.values() for stated, found, _ in rows for v in (stated, found)]

@@ -45,7 +45,6 @@ class MotionClips:
         return np.arange(len(self.positions)) / FPS
 
     def every(self, step: int) -> MotionClips:
-        """Return every n-th clip."""
         return self._take(np.arange(0, len(self.offsets), step))
 
     def farthest(self, count: int) -> MotionClips:

@@ -205,11 +205,8 @@ def _is_same(recorded: str | list[float], now: str | list[float]) -> bool:
 
 
 def require_committed(directory: Path) -> None:
-    """Refuse to write results to `RESULTS` that no commit can reproduce. Call it before measuring.
-
-    Raises:
-        UncommittedError: the checkout differs from its commit, in more than results and documents.
-    """
+    """Refuse to write results to `RESULTS` that no commit can reproduce. Call it before measuring. Raises
+    UncommittedError if the checkout differs from its commit, in more than results and documents."""
     if directory.resolve() == RESULTS.resolve() and (files := uncommitted()):
         raise UncommittedError(
             f"results are measured at a commit, but {', '.join(files[:5])}{', ...' * (len(files) > 5)} differ from it: "

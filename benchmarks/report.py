@@ -133,11 +133,7 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[s
 
 
 def page(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """Return an overview, then all tables and pictures by chapter.
-
-    Raises:
-        KeyError: no chapter names a result.
-    """
+    """Return an overview, then all tables and pictures by chapter. Raises KeyError if no chapter names a result."""
     titles = {name: title for chapter in CHAPTERS.values() for name, title in chapter.items()}
     if unnamed := results.keys() - titles.keys():
         raise KeyError(f"results {', '.join(sorted(unnamed))}: name them in a chapter of benchmarks/report.py")
@@ -223,7 +219,6 @@ def _summary(found: Mapping[str, float]) -> str:
 
 
 def main(args: Args) -> None:
-    """Rewrite both files in place."""
     results = load(args.results)
     args.readme.write_text(fill(args.readme.read_text(), results))
     args.page.write_text(page(results))

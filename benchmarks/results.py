@@ -57,8 +57,6 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a study."""
-
     tables: list[Table]
     """tables to read; the first is printed first"""
     data: dict[str, Any]

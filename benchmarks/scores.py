@@ -162,16 +162,11 @@ def pivot(
         cell = "–" if value is None else value if isinstance(value, str) else f"{value:.{digits}f}"
         rows.setdefault((record["method"], record["delay"]), {})[record[column]] = cell
     run = list(dict.fromkeys(method for method, _ in rows))
-    return Table(
-        name=name,
-        title=title,
-        columns=["method", "delay, frames", *columns],
-        rows=[
-            [method, "offline" if delay < 0 else str(delay), *(cells.get(c, "–") for c in columns)]
-            for (method, delay), cells in sorted(rows.items(), key=lambda row: (run.index(row[0][0]), row[0][1]))
-        ],
-        note=note,
-    )
+    cells = [
+        [method, "offline" if delay < 0 else str(delay), *(found.get(c, "–") for c in columns)]
+        for (method, delay), found in sorted(rows.items(), key=lambda row: (run.index(row[0][0]), row[0][1]))
+    ]
+    return Table(name, title, ["method", "delay, frames", *columns], cells, note)
 
 
 def _mean(values: Floats) -> Floats:
@@ -213,13 +208,7 @@ DRAWS = 4000
 
 
 class Interval(NamedTuple):
-    """A mean over people.
-
-    Attributes:
-        mean: mean of the people's own means; NaN without people.
-        low, high: 95 % interval; NaN for a single person.
-        people: number of people.
-    """
+    """Mean of the people's own means, NaN without people; its 95 % interval, NaN for one person; number of people."""
 
     mean: float
     low: float

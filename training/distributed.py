@@ -30,7 +30,6 @@ def rank() -> int:
 
 
 def processes() -> int:
-    """Return the number of processes that train together."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
@@ -46,11 +45,8 @@ def writes() -> bool:
 
 
 def share(batch: int) -> int:
-    """Return the number of a batch's samples that this process draws.
-
-    Raises:
-        ValueError: the batch cannot be divided evenly.
-    """
+    """Return the number of a batch's samples that this process draws. Raises ValueError if the batch cannot be divided
+    evenly."""
     if batch % processes():
         raise ValueError(f"batch: expected a multiple of the {processes()} processes of torchrun, got {batch}")
     return batch // processes()

@@ -133,19 +133,15 @@ class Recipe(Generic[Network]):
         started_anew: Callable[[Network], None] = lambda network: None,
         calibrated: Callable[[Network], Any] | None = None,
     ) -> Path:
-        """Train with the user's options, and write the weights with their card.
+        """Train with the user's options, and write the weights with their card; returns the path of the weights.
 
         Args:
             options: options of ``steadypose train``.
-            described: description of the model for the card.
-            data: description of the training data for the card.
+            described, data: descriptions of the model and of the training data for the card.
             licence: licence of the weights; by default, their set's.
             started_anew: fits what gradients do not fit, such as the scale of features; called if the training starts
                 without other weights and without a checkpoint.
             calibrated: returns the trained network's configuration; by default, the original one.
-
-        Returns:
-            The path of the weights.
         """
         path, iterations = options.path(self.model), options.iterations or self.iterations
         torch.manual_seed(options.seed)
@@ -177,13 +173,9 @@ class TrainingRun:
     Under torchrun, all processes start from the first one's state, and only the first writes and evaluates. Each draws
     its share of a batch, and gradients are averaged before each optimiser step.
 
-    Args:
-        directory: folder of checkpoints, ``curves.json`` and ``curves.png``; a checkpoint there is resumed.
-        model: content of the checkpoint: the network, or an `nn.ModuleDict` of it and, for example, averaged weights
-            that a post-step hook of the optimiser updates.
-        schedule: schedule of the learning rate, stepped after each optimiser step.
-        iterations: number of steps of the whole training.
-        evaluations: number of evaluations and checkpoints.
+    ``directory`` is the folder of checkpoints, ``curves.json`` and ``curves.png``. ``model`` is the content of the
+    checkpoint: the network, or an `nn.ModuleDict` of it and, for example, averaged weights that a post-step hook of the
+    optimiser updates. ``iterations`` and ``evaluations`` (also checkpoints) are those of the whole training.
     """
 
     def __init__(
@@ -240,17 +232,10 @@ class TrainingRun:
         self._model.eval()
 
     def save(self, path: Path, model: nn.Module, config: Mapping[str, Any], card: Mapping[str, str]) -> Path:
-        """Write the trained model, its card and its curves.
+        """Write the trained model with the configuration that rebuilds it, its card and its curves; returns ``path``.
 
-        Args:
-            path: ``MODEL-SET.safetensors`` in the run's folder; `training.weights.install` copies it to where nodes
-                read.
-            model: the trained model.
-            config: configuration that rebuilds the model.
-            card: heading to content: model, data, licence and training; the last evaluation is added.
-
-        Returns:
-            ``path``.
+        ``path`` is ``MODEL-SET.safetensors`` in the run's folder; `training.weights.install` copies it to where nodes
+        read. ``card`` is content by heading: model, data, licence and training; the last evaluation is added.
         """
         curves = path.with_suffix(".png")
         latest = ", ".join(f"{k} {v:.4g}" for k, v in self.curves[-1].items())

@@ -66,7 +66,6 @@ def install(path: Path) -> Path:
 
 
 def arrays_of(network: nn.Module) -> Arrays:
-    """Return copies of a network's weights for its live form."""
     return {name: tensor.detach().float().numpy().copy() for name, tensor in network.state_dict().items()}
 
 

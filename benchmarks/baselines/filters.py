@@ -52,7 +52,6 @@ def missing(seen: Floats) -> NDArray[np.bool_]:
 
 
 def raw(seen: Floats, stamps_s: Floats, delay: int) -> Floats:
-    """Return the input."""
     return seen
 
 
@@ -105,7 +104,6 @@ def _weight(cutoff_hz: Floats | float, step_s: Floats) -> Floats:
 
 
 def constant_velocity(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
-    """Apply a constant-velocity Kalman filter; with a delay, its fixed-lag RTS smoother."""
     return fixed_lag(seen, stamps_s, delay, 2, density)
 
 
@@ -118,7 +116,6 @@ def constant_velocity_by_joint(seen: Floats, stamps_s: Floats, delay: int, densi
 
 
 def constant_acceleration(seen: Floats, stamps_s: Floats, delay: int, density: float) -> Floats:
-    """Apply a constant-acceleration Kalman filter; with a delay, its fixed-lag RTS smoother."""
     return fixed_lag(seen, stamps_s, delay, 3, density)
 
 

@@ -37,8 +37,6 @@ _OTHER_SIDE = [
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A smoothed clip."""
-
     inputs: Floats
     """(T, 66) metres, joints in the trunk's frame, from the middle of the hips; smoothed with the part of the delay
     that the regression does not look ahead itself"""

@@ -53,7 +53,6 @@ class RecurrentDenoiser(nn.Module):
 def train(
     motion: MotionClips, delays: Sequence[int], steps: int, seed: int, track: Track = lambda x: x
 ) -> RecurrentDenoiser:
-    """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng, net = np.random.default_rng((seed, 1)), RecurrentDenoiser(delays)
 

@@ -91,7 +91,6 @@ class RotationNet(nn.Module):
 def train_rotations(
     motion: MotionClips, joints: Sequence[int], lag: int, steps: int, track: Track = lambda x: x
 ) -> RotationNet:
-    """Train on clips corrupted anew in every step."""
     torch.manual_seed(0)
     rng, net = np.random.default_rng(1), RotationNet(joints, lag)
     truth = global_rotations(motion.rotations)[:, :, net.joints]

@@ -52,7 +52,6 @@ class SmoothNet(nn.Module):
 
 
 def train(motion: MotionClips, steps: int, seed: int, track: Track = lambda x: x) -> SmoothNet:
-    """Train on clips corrupted anew in every step."""
     torch.manual_seed(seed)
     rng, net = np.random.default_rng((seed, 1)), SmoothNet()
 

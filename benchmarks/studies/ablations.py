@@ -128,7 +128,6 @@ FAULTY = (
 
 
 def run(bench: Bench) -> Result:
-    """Measure the prior without each part in every condition, then the trajectory."""
     clips = bench.clips(FRAMES, 4 if bench.quick else CLIPS)
     cost = costs(clips)
     records: list[dict[str, Any]] = []
@@ -258,8 +257,6 @@ def _table(
     cost: Mapping[str, float],
     clips: MotionClips,
 ) -> Table:
-    """Build a table with a row for each part: errors in each condition relative to what ships, and milliseconds. The
-    row of what ships has millimetres."""
     conditions = list(dict.fromkeys(record["condition"] for record in records))
     by_key = {(record["method"], record["condition"]): record for record in records}
     rows = []

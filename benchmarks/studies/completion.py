@@ -63,7 +63,6 @@ _NETWORK, _SEARCH = "complete", "complete --optimise"
 
 
 def run(bench: Bench) -> Result:
-    """Run every method for every hidden part."""
     clips = bench.clips(FRAMES, 64)
     train = prepared_set(bench.data, "train") if bench.data.is_file() else as_set(bench.training_clips())
     nearest = NearestPose(train, FRAMES)
@@ -203,15 +202,10 @@ def _table(records: list[dict[str, Any]], ratios: list[dict[str, Any]], clips: i
         for part in HIDDEN
     ]
     return Table(
-        name="completion",
-        title="Parts of the body that nobody sees, mm off",
-        columns=["hidden", *methods, *columns],
-        rows=rows,
-        note=(
-            f"{clips} windows of {FRAMES} frames, spread evenly over the sources; joints hidden in all frames, about "
-            "the root, which is known. `complete` is the transformer with HG-VAE's completion as a second opinion."
-        ),
-    )
+        "completion", "Parts of the body that nobody sees, mm off", ["hidden", *methods, *columns], rows,
+        f"{clips} windows of {FRAMES} frames, spread evenly over the sources; joints hidden in all frames, about "
+        "the root, which is known. `complete` is the transformer with HG-VAE's completion as a second opinion.",
+    )  # fmt: skip
 
 
 def _search_table(records: list[dict[str, Any]]) -> Table:

@@ -91,7 +91,6 @@ def _at(places: Floats, times: Floats) -> Floats:
 
 
 def run(bench: Bench) -> Result:
-    """Score the rules and the network under each noise."""
     assert bench.mocap is not None
     trials = read_trials(bench.mocap / "contacts_grf.npz")[:: 10 if bench.quick else 1]
     network = LiveContacts.load("default")
@@ -161,17 +160,11 @@ def _scores(both: int, found: int, true: int) -> dict[str, float]:
 def _table(records: list[dict]) -> Table:
     kinds = [kind for kind in (*KINDS, "all") if kind in records[0]]
     return Table(
-        name="contacts",
-        title="Feet under load, against force plates: F1",
-        columns=["method", "noise, cm", *kinds, "walking: recall", "walking: precision"],
-        rows=[
-            [r["method"], f"{100 * r['noise_m']:.0f}", *(f"{r[kind]['f1']:.3f}" for kind in kinds),
-             *(f"{r.get('walking', r['all'])[key]:.3f}" for key in ("recall", "precision"))]
-            for r in records
-        ],
-        note=(
-            "Markers of ankle and toe alone, in three streams of 30 Hz each; noise is independent from frame to "
-            f"frame and goes through the smoother, delay {DELAY}. Two subjects, on whom nothing was trained; the rule "
-            "has its 0.7 m/s from them."
-        ),
+        "contacts", "Feet under load, against force plates: F1",
+        ["method", "noise, cm", *kinds, "walking: recall", "walking: precision"],
+        [[r["method"], f"{100 * r['noise_m']:.0f}", *(f"{r[kind]['f1']:.3f}" for kind in kinds),
+          *(f"{r.get('walking', r['all'])[key]:.3f}" for key in ("recall", "precision"))] for r in records],
+        "Markers of ankle and toe alone, in three streams of 30 Hz each; noise is independent from frame to "
+        f"frame and goes through the smoother, delay {DELAY}. Two subjects, on whom nothing was trained; the rule "
+        "has its 0.7 m/s from them.",
     )  # fmt: skip

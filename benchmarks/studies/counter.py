@@ -66,7 +66,6 @@ def truth_at(motion: Motion, scene: str, stamps_s: Floats) -> Body:
 
 
 def behind(frames: Sequence[PoseRaw], joints: Sequence[int]) -> list[PoseRaw]:
-    """Return the frames without the sensor's joints on these canonical joints."""
     seen = ~np.isin(mount(CAMERA.skeleton).joint, joints)
     return [
         PoseRaw(raw.stamp_ns, raw.frame_id, raw.source, raw.skeleton, raw.sensor_pose, raw.calibrated,
@@ -76,7 +75,6 @@ def behind(frames: Sequence[PoseRaw], joints: Sequence[int]) -> list[PoseRaw]:
 
 
 def product(frames: Sequence[PoseRaw]) -> Body:
-    """Run the whole pipeline as it ships, and its events."""
     detector, sensor = EventDetector(), np.array(CAMERA.position)
     found: dict[str, list[Any]] = defaultdict(list)
     for world in worlds_of(frames):
@@ -129,7 +127,6 @@ def errors(found: Body, motion: Motion, scene: str) -> dict[str, Floats]:
 
 
 def run(bench: Bench) -> Result:
-    """Run both methods on all people behind each counter."""
     people, records = PEOPLE[:1] if bench.quick else PEOPLE, []
     frames: dict[str, dict[str, list[Floats]]] = defaultdict(lambda: defaultdict(list))
     for name, seed in bench.progress.track([(s, n) for s in SHOWN for n in people], description="people"):
@@ -155,13 +152,12 @@ def _table(pooled: Mapping[str, Mapping[str, Floats]], people: int) -> Table:
         row += [f"{mean['contacts']:.0f}", f"{mean['feet']:.0f}", f"{mean['ratio'] ** 0.5:.2f}"] if legs else [NONE] * 3
         rows.append(row)
     return Table(
-        name="counter",
-        title="People behind a counter, filmed with a Kinect's errors",
-        columns=["method", "facing p50, °", "p95, °", "place on the floor, mm", "height of the hips, mm",
+        "counter", "People behind a counter, filmed with a Kinect's errors",
+        ["method", "facing p50, °", "p95, °", "place on the floor, mm", "height of the hips, mm",
                  "of the head, mm", "sitting or standing right, %", "contacts of legs published, %", "feet, mm",
                  "feet, by stated"],
-        rows=rows,
-        note=f"{people} simulated people, who walk, sit down and rise, reach (lean and bend) or idle; delay "
+        rows,
+        f"{people} simulated people, who walk, sit down and rise, reach (lean and bend) or idle; delay "
         f"{PriorSettings().delay}; a calibrated camera 1.4 m high. Hidden throughout, as by a counter whose edge the "
         "camera sees about 0.5 m (knees) or 1 m (hips) above the floor at a standing person. Means over frames after "
         "the first second. Facing is normal to hips and shoulders. Frames between standing upright and sitting are "

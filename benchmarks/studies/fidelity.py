@@ -67,7 +67,6 @@ def methods(bench: Bench) -> Methods:
 
 
 def run(bench: Bench) -> Result:
-    """Measure errors by speed."""
     clips = bench.clips(FRAMES, 6 if bench.quick else CLIPS)
     middle = clips.positions[FRAMES // 2, :, J["pelvis"]] * (1.0, 1.0, 0.0)
     truth = clips.positions - (middle + CAMERA)[:, None]
@@ -92,7 +91,6 @@ def run(bench: Bench) -> Result:
 
 
 def _bins(speed: Floats) -> dict[str, NDArray[np.bool_]]:
-    """Return the masks of the speed bins, by name."""
     return {
         f"{low:g}-{high:g} m/s" if np.isfinite(high) else f"above {low:g}": (speed >= low) & (speed < high)
         for low, high in pairwise(SPEEDS)
@@ -148,7 +146,6 @@ SUMMARISED = (0, 4)
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
-    """Build a table of the best tuned filter, the banks and steadypose, by noise and delay: position / acceleration."""
     noises = [name for name in dict.fromkeys(r["condition"] for r in records) if "depth" not in name]
     rows: list[list[str]] = []
     for delay in SUMMARISED:
@@ -178,7 +175,6 @@ def _source_table(records: Sequence[Mapping[str, Any]], delay: int, clips: Motio
 
 
 def _speed_table(records: Sequence[Mapping[str, Any]], delay: int, note: str) -> Table:
-    """Build a table of raw, the best tuned filter, the banks and steadypose, by noise and speed."""
     bins = list(dict.fromkeys(name for record in records for name in record["by_speed"]))
     rows: list[list[str]] = []
     for condition in dict.fromkeys(record["condition"] for record in records):

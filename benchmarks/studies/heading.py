@@ -39,7 +39,6 @@ _STREAMS = ROOT / "sim_data"
 
 
 def run(bench: Bench) -> Result:
-    """Run every method on the Kinect; then aimed bones and steadypose on the bundled streams."""
     roots = baselines(bench.training_clips(), bench.seeds[0])
     kinect = _kinect(bench, roots)
     bundled = {

@@ -153,7 +153,6 @@ DEPENDS_ON = ("hgvae weights", "training.data.hgvae_windows", "training.networks
 
 
 def run(bench: Bench) -> Result:
-    """Make all tables and plots."""
     model = load_network(HGVAE, HGVAEConfig.from_dict, "default", "hgvae")
     prepared = bench.data.is_file()
     motion = prepared_set(bench.data, "val") if prepared else as_set(bench.clips(90, 60))

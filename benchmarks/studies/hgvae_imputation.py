@@ -177,7 +177,6 @@ def _guess(window: Floats, size: float, clean: Tracks, observed: Mask, line: Flo
 
 
 def sweep(bench: Bench, model: HGVAE, motion: MotionSet) -> Result:
-    """Measure the squared error of imputation for every method and every degree of occlusion."""
     windows = Windows(motion)
     records: list[dict[str, Any]] = []
     for condition, hide in bench.progress.track(CONDITIONS.items(), description="imputation", total=len(CONDITIONS)):

@@ -85,7 +85,6 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def run(bench: Bench) -> Result:
-    """Run every method in every condition."""
     clips = bench.clips()
     kept = ("arm behind", "0.5 s") if bench.quick else tuple(CONDITIONS)
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
@@ -147,8 +146,6 @@ def given_the_seen(seen: Floats, stamps_s: Floats, delay: int, gaussian: Conditi
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:
-    """Build a table of hidden joints, mm: the best baseline that does not use the whole body, those that do, and
-    steadypose."""
     conditions = list(dict.fromkeys(r["condition"] for r in records))
     rows: list[list[str]] = []
     for delay in (0, 4):

@@ -183,7 +183,6 @@ _PER_FRAME = "per-frame fit, smoothed (stage 2)"
 
 
 def run(bench: Bench) -> Result:
-    """Make all tables."""
     models = {SHIPS: model_of(bench, SHIPS)} | {name: model_of(bench, name) for name in VARIANTS}
     count = 2 if bench.quick else FUTURES
     clips = bench.clips(62, count)
@@ -256,12 +255,10 @@ def _futures_table(records: Sequence[dict[str, Any]], clips: int) -> Table:
         "contact_accuracy": "contact accuracy", "apd_mm": "APD over 5 s, mm", "astray_percent": "astray in 5 s, %",
     }  # fmt: skip
     return Table(
-        name="humor-futures",
-        title="Futures of 2 s (HuMoR's Table 1): 62 frames, the first two known",
-        columns=["method", *keys.values()],
-        rows=[[r["method"], *(_cell(r, key) for key in keys)] for r in records],
-        note=f"{clips} clips. All but what ships and the body that stands still are trained alike and briefly.",
-    )
+        "humor-futures", "Futures of 2 s (HuMoR's Table 1): 62 frames, the first two known", ["method", *keys.values()],
+        [[r["method"], *(_cell(r, key) for key in keys)] for r in records],
+        f"{clips} clips. All but what ships and the body that stands still are trained alike and briefly.",
+    )  # fmt: skip
 
 
 def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Table]:
@@ -280,15 +277,13 @@ def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Tabl
     }
     return [
         Table(
-            name=f"humor-{name}",
-            title=title,
-            columns=["method", *keys.values()],
-            rows=[[r["method"], *(_cell(r, key) for key in keys)] for r in records[name]],
-            note="Mean over all joints, without alignment; legs: knees, ankles, toes; a filter has no answer "
+            f"humor-{name}", title, ["method", *keys.values()],
+            [[r["method"], *(_cell(r, key) for key in keys)] for r in records[name]],
+            "Mean over all joints, without alignment; legs: knees, ankles, toes; a filter has no answer "
             "for what it never saw. Seconds are of a processor.",
         )
         for name, title in titles.items()
-    ]
+    ]  # fmt: skip
 
 
 def _cell(record: dict[str, Any], key: str) -> str:

@@ -49,8 +49,6 @@ POINTS = 200
 
 @dataclass(frozen=True)
 class Answer:
-    """Estimate of a method for one clip."""
-
     joints: Floats
     """(T, 22, 3) metres, world"""
     load: Floats | None = None
@@ -181,5 +179,4 @@ def _mm(values: Floats) -> float | None:
 
 
 def shipped() -> HumorNet:
-    """Return the default weights."""
     return load_network(HumorNet, HumorConfig.from_dict, "default", "humor")

@@ -91,7 +91,6 @@ class Truth(NamedTuple):
 
 
 def run(bench: Bench) -> Result:
-    """Run every method over every gap."""
     clips = bench.clips(FRAMES, 96)
     train = prepared_set(bench.data, "train") if bench.data.is_file() else as_set(bench.training_clips())
     deviation = place_deviation(train)

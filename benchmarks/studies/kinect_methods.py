@@ -81,8 +81,6 @@ WORST = 0.1
 
 
 class Scores(NamedTuple):
-    """Scores of a method, one number per clip."""
-
     position: Floats  # (C,) metres
     moving: Floats  # (C,) metres, with this clip's own offset: the part of the error that changes with the pose
     acceleration: Floats  # (C,) metres/frame²
@@ -148,18 +146,12 @@ def summary(clips: Sequence[Clip], scores: Scores) -> dict[str, Any]:
 
 
 def deviation(error: Floats, sigma: Floats, anomaly: Floats, flagged: NDArray[np.bool_]) -> dict[str, float | None]:
-    """Measure how well the predicted deviation and the anomaly indicate the error.
+    """Measure how well the predicted deviation (N, 13), metres, and the anomaly (N,) of each frame indicate the error.
 
-    Args:
-        error: (N, 13) metres, NaN where Vicon has no joint.
-        sigma: (N, 13) metres, predicted.
-        anomaly: (N,) score of each frame.
-        flagged: (N,) whether a frame is flagged as an anomaly.
-
-    Returns:
-        the rank correlation of sigma with the error; areas under the ROC curve of sigma for joints off by more than 10
-            cm, and for the worst tenth of the frames by mean error, of the root mean square of sigma over the joints
-            and of the anomaly (None if there is no such joint); the error-to-sigma ratio; the share flagged.
+    ``error`` (N, 13) is in metres, NaN where Vicon has no joint; ``flagged`` (N,) frames count as anomalies. Returns
+    the rank correlation of sigma with the error; areas under the ROC curve (None if one class is empty) of sigma for
+    joints off by more than `OFF`, and, for the `WORST` frames by mean error, of the root mean square of sigma over the
+    joints and of the anomaly; the error-to-sigma ratio; and the share flagged.
     """
     known = np.isfinite(error) & np.isfinite(sigma)
     off = error[known] > OFF
@@ -204,8 +196,6 @@ Run = Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
 
 @dataclass(frozen=True)
 class Method:
-    """A method to clean clips, at one delay."""
-
     name: str
     """name in tables"""
     delay: int

@@ -1,11 +1,10 @@
 """Real Kinect against Vicon: how cleaning reduces the noise of a real sensor (UI-PRMD), each person left out in turn.
 
-The protocol is the same for every method. The input is the Kinect's 22 joints at 30 Hz. 13 joints (head, shoulders,
-elbows, wrists, hips, knees, ankles) are scored against the Vicon's joint centres (`prior.mocap.plug_in_gait`). Each
-clip is aligned by one rotation and one translation. Then a constant offset per joint is added, in the frame of the
-trunk spanned by hips and shoulders, because the two systems define "hip" differently. For each of the eight people,
-each method's offset is learned from its own output on the others. So are the parameters of baselines and the correction
-of "sensor known". At a delay of k frames, an estimate uses k later frames, or those up to the end of the clip.
+The input is the Kinect's 22 joints at 30 Hz. 13 joints (head, shoulders, elbows, wrists, hips, knees, ankles) are
+scored against the Vicon's joint centres (`prior.mocap.plug_in_gait`), aligned as in `kinect_methods`, because the two
+systems define "hip" differently. For each of the eight people, each method's offset is learned from its own output on
+the others. So are the parameters of baselines and the correction of "sensor known". At a delay of k frames, an estimate
+uses k later frames, or those up to the end of the clip.
 
 The smoother's mixture that ships was trained on the Kinect's output for s01 to s06, with the Vicon as reference, and
 chosen on s07 and s08. The other networks have seen the Vicon's motion of s01 to s06. So "each person left out" holds
@@ -13,8 +12,8 @@ for offsets, baselines and the correction, but not for steadypose's smoother. It
 people it was fitted to.
 
 s01's two systems are not synchronised: its column is shown, but no mean includes it. More than half of a method's error
-here is a constant that differs between persons and definitions of a joint, which no method can know. The second figure
-of position, "moving", subtracts each joint's constant offset in each clip, for all methods alike.
+here is a constant that differs between persons and definitions of a joint, which no method can know; the second figure
+of position, "moving", subtracts it.
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ OFFSET_CLIPS, TUNING_CLIPS = 3, 5
 
 
 def run(bench: Bench) -> Result:
-    """Leave one person out, tune, run and score; then score all people's clips together."""
     assert bench.mocap is not None
     path = bench.mocap / "ui_prmd.npz"
     subjects = ("s01", "s05", "s08") if bench.quick else SUBJECTS
@@ -152,7 +150,6 @@ def _table(records: Sequence[dict[str, Any]], clips: Sequence[Clip], subjects: S
 
 
 def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subjects: Sequence[str]) -> Table:
-    """Build a table of how well sigma and anomaly indicate the error, for each person, at a delay of 4."""
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
         "auroc_worst": "AUROC, worst tenth of frames", "auroc_worst_anomaly": "of the anomaly",

@@ -58,7 +58,6 @@ def sensed(clips: MotionClips, layout: str, rng: np.random.Generator, *, counter
 
 
 def run(bench: Bench) -> Result:
-    """Run both methods on every layout."""
     clips = bench.clips()
     gaussian = ConditionalGaussian(bench.training_clips().positions.reshape(-1, 22, 3))
     records: list[dict[str, Any]] = []

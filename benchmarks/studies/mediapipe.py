@@ -44,7 +44,6 @@ class Stream(NamedTuple):
 
 
 def read_streams(path: Path) -> list[Stream]:
-    """Read both halves of the frames of each camera."""
     streams = []
     with np.load(path) as data:
         reference = np.where(data["reference/valid"][..., None], data["reference/positions"], np.nan)
@@ -70,7 +69,6 @@ def error_of(answer: Floats, stream: Stream) -> dict[str, float]:
 
 
 def run(bench: Bench) -> Result:
-    """Run every method on every stream, with filters tuned on the same streams."""
     assert bench.mocap is not None
     streams = read_streams(bench.mocap / "mediapipe_pose.npz")
     seen = side_by_side([stream.seen for stream in streams])

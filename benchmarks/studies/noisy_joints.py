@@ -42,7 +42,6 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def run(bench: Bench) -> Result:
-    """Run every method in every condition."""
     clips = bench.clips()
     kept = ("4 cm", "lasting 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
     track = partial(bench.progress.track, description="FLK")

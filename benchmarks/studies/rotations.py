@@ -90,7 +90,6 @@ class _Turned(NamedTuple):
 
 
 def run(bench: Bench) -> Result:
-    """Run every method in every condition."""
     assert bench.mocap is not None
     clips = read(bench.mocap, bench.split, 4 if bench.quick else 8)
     rng, scored = np.random.default_rng(bench.seeds[0]), slice(SKIPPED, None)
@@ -188,7 +187,6 @@ def _share(values: list[float] | None) -> str:
 
 
 def pair(values: list[float]) -> str:
-    """Return a median and a 95th percentile as text."""
     return f"{values[0]:.1f} / {values[1]:.1f}"
 
 
@@ -223,7 +221,6 @@ def _table(records: list[dict[str, Any]], roots: tuple[str, ...]) -> Table:
 
 
 def _bends(records: list[dict[str, Any]]) -> Table:
-    """Build a table of twist by how straight a limb is, and of all joints by speed."""
     kept = [record for record in records if record["method"] in METHODS]
     rows = [
         [

@@ -54,7 +54,6 @@ FRAMES = 192
 
 
 def run(bench: Bench) -> Result:
-    """Measure the whole pipeline beside filters, then the fusion without a root."""
     clips = bench.clips(FRAMES, 400).farthest(4 if bench.quick else 24)
     some = clips.every(TUNED_ON)
     other = correlated(some.positions, NOISE, np.random.default_rng(1))
@@ -199,8 +198,6 @@ HORIZONS = (15, 30, 60)
 
 
 class Way(NamedTuple):
-    """Output of a method, in the world."""
-
     positions: Floats
     """(T, 22, 3) metres"""
     sigma: Floats
@@ -325,7 +322,6 @@ class Errors:
 
 
 def rms(values: ArrayLike) -> float:
-    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -359,24 +355,20 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
 
 def _root_table(by_speed: Mapping[str, Mapping[str, float]]) -> Table:
     return Table(
-        name="world-root",
-        title="The root and its velocity by true speed: RMS error along an axis, found by standard deviation stated",
-        columns=["m/s", "frames", "root, mm", "by stated", "velocity, m/s", "by stated"],
-        rows=[
-            [name, str(r["frames"]), f"{r['position_mm']:.1f}", f"{r['position_ratio']:.2f}",
-             f"{r['velocity_m_s']:.3f}", f"{r['velocity_ratio']:.2f}"]
-            for name, r in by_speed.items()
-        ],
-        note="The same clips. By stated: 1 is honest.",
+        "world-root",
+        "The root and its velocity by true speed: RMS error along an axis, found by standard deviation stated",
+        ["m/s", "frames", "root, mm", "by stated", "velocity, m/s", "by stated"],
+        [[name, str(r["frames"]), f"{r['position_mm']:.1f}", f"{r['position_ratio']:.2f}",
+          f"{r['velocity_m_s']:.3f}", f"{r['velocity_ratio']:.2f}"] for name, r in by_speed.items()],
+        "The same clips. By stated: 1 is honest.",
     )  # fmt: skip
 
 
 def _hidden_table(hidden: Mapping[str, Mapping[str, float]]) -> Table:
     keys = [key for key in next(iter(hidden.values())) if key.startswith("hidden")]
     return Table(
-        name="world-hidden",
-        title="Without a root: the trunk hidden for two seconds at a time",
-        columns=["method", *(key.removeprefix("hidden ").removeprefix("hidden: ") for key in keys)],
-        rows=[[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in hidden.items()],
-        note="Root: horizontal error after so long. Squared error over variance: 1 is honest.",
-    )
+        "world-hidden", "Without a root: the trunk hidden for two seconds at a time",
+        ["method", *(key.removeprefix("hidden ").removeprefix("hidden: ") for key in keys)],
+        [[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in hidden.items()],
+        "Root: horizontal error after so long. Squared error over variance: 1 is honest.",
+    )  # fmt: skip

@@ -268,8 +268,6 @@ EARLY_S, LATE_S = 0.5, 1.0
 
 @dataclass
 class Score:
-    """Score of one kind."""
-
     met: int = 0
     missed: int = 0
     false: int = 0

@@ -84,12 +84,10 @@ def simulated(name: str, seed: int) -> tuple[Scene, list[PoseRaw]]:
 
 
 def scored(raw: Iterable[PoseRaw], scene: Scene) -> dict[EventKind, Score]:
-    """Score the detections in a stream against the labels of its scene."""
     return score(told_of(worlds_of(raw), scene, EventSettings()), labels_of(scene), scene.undecided)
 
 
 def record_of(kind: EventKind, found: Score) -> dict[str, Any]:
-    """Return a record for the results file."""
     counts = {"met": found.met, "missed": found.missed, "false": found.false}
     return {"kind": kind.name, **counts, "delays_s": found.delays_s}
 
@@ -109,23 +107,14 @@ def run(bench: Bench) -> Result:
 
 
 def table_of(name: str, title: str, totals: Mapping[EventKind, Score], note: str) -> Table:
-    """Build a table with a row for each kind and one for all."""
     whole = Score()
     for found in totals.values():
         whole.add(found)
     rows = [(kind.name.lower().replace("_", " "), totals[kind]) for kind in EventKind if kind in totals]
-    return Table(
-        name=name,
-        title=title,
-        columns=["event", "labels", "precision", "recall", "F1", "delay p50, ms", "delay p95, ms"],
-        rows=[
-            [
-                kind,
-                str(found.met + found.missed),
-                *(f"{share:.3f}" for share in found.shares),
-                *(f"{1e3 * q:.0f}" for q in np.quantile(found.delays_s or [np.nan], (0.5, 0.95))),
-            ]
-            for kind, found in [*rows, ("all", whole)]
-        ],
-        note=note,
-    )
+    cells = [
+        [kind, str(found.met + found.missed), *(f"{share:.3f}" for share in found.shares),
+         *(f"{1e3 * q:.0f}" for q in np.quantile(found.delays_s or [np.nan], (0.5, 0.95)))]
+        for kind, found in [*rows, ("all", whole)]
+    ]  # fmt: skip
+    columns = ["event", "labels", "precision", "recall", "F1", "delay p50, ms", "delay p95, ms"]
+    return Table(name, title, columns, cells, note)

@@ -161,7 +161,6 @@ def percentiles(values: ArrayLike) -> dict[str, float]:
 
 
 def run(bench: Bench) -> Result:
-    """Measure computing time, latency and drops of the nodes on this machine."""
     seconds = 10.0 if bench.quick else 60.0
     frames = recorded()
     with tempfile.TemporaryDirectory() as folder:
@@ -181,7 +180,6 @@ def run(bench: Bench) -> Result:
 
 
 def recorded() -> list[PoseRaw]:
-    """Return the frames of the stream that is played."""
     with RecordingReader(RECORDING) as reader:
         return [message for _, _, message in reader.messages([POSE_RAW]) if isinstance(message, PoseRaw)]
 

@@ -49,7 +49,6 @@ BUSY = ", processors busy"
 
 @contextmanager
 def busy() -> Iterator[None]:
-    """Keep every processor busy."""
     spin = [sys.executable, "-c", "while True: pass"]
     others = [subprocess.Popen(spin) for _ in range(os.cpu_count() or 1)]
     try:
@@ -113,7 +112,6 @@ def longest_gap(times: Sequence[float], until_s: float) -> float:
 
 
 def run(bench: Bench) -> Result:
-    """Measure the time to the first pose, and of each node's return after SIGKILL, on this machine."""
     number = 2 if bench.quick else KILLS
     starts = bench.progress.track(range(number), description="starts")
     with tempfile.TemporaryDirectory() as never_compiled:
@@ -127,13 +125,10 @@ def run(bench: Bench) -> Result:
 
 def _table(found: dict[str, list[float]]) -> Table:
     return Table(
-        name="restart",
-        title="All nodes are started, or one is killed: seconds without pose/world",
-        columns=["node", "p50", "p95", "longest", "times"],
-        rows=[
-            [name, *(f"{q:.2f}" for q in np.percentile(gaps, (50, 95, 100))), str(len(gaps))]
-            for name, gaps in found.items()
-        ],
-        note="From `steadypose run` to the first message; and SIGKILL to one node after the other, at camera rate: the "
+        "restart", "All nodes are started, or one is killed: seconds without pose/world",
+        ["node", "p50", "p95", "longest", "times"],
+        [[name, *(f"{q:.2f}" for q in np.percentile(gaps, (50, 95, 100))), str(len(gaps))]
+         for name, gaps in found.items()],
+        "From `steadypose run` to the first message; and SIGKILL to one node after the other, at camera rate: the "
         "longest time between two messages that arrive. Busy: as many other processes as processors.",
-    )
+    )  # fmt: skip

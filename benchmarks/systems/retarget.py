@@ -37,13 +37,9 @@ ALL = "all"
 
 
 def faults(robot: Robot, poses: Sequence[RobotPose]) -> dict[str, float]:
-    """Measure the published poses of one stream.
-
-    Returns:
-        The largest breach of a joint's range, radians; the largest speed of a joint, of its limit; the largest distance
-        of a standing foot from where it came to stand, and of any foot below the floor, mm; and the percentage of poses
-        in which at least one foot is published as standing.
-    """
+    """Return of the published poses of one stream the largest breach of a joint's range, radians; the largest
+    speed of a joint, of its limit; the largest distance of a standing foot from where it came to stand, and of any foot
+    below the floor, mm; and the percentage of poses in which at least one foot is published as standing."""
     import mujoco
 
     data = mujoco.MjData(robot.model)
@@ -87,7 +83,6 @@ def followed(recording: Path) -> dict[str, Any]:
 
 
 def run(bench: Bench) -> Result:
-    """Measure the retargeting of the bundled streams on this machine."""
     streams = sorted(path.parent for path in STREAMS.glob("*/metadata.yaml"))[: 1 if bench.quick else None]
     found = {path.name: followed(path) for path in bench.progress.track(streams, description="retargeting")}
     numpy = round(numpy_ms(), 3)
@@ -109,19 +104,11 @@ def _table(found: dict[str, dict[str, Any]], numpy: float) -> Table:
         "retarget",
         "One person to a robot of 29 joints: a frame's processor time, limits, standing feet",
         records,
-        {
-            "stream": "{stream}",
-            "frames": "{frames}",
-            "cpu, p50, ms": "{p50:.2f}",
-            "cpu, p99, ms": "{p99:.2f}",
-            "p50, of numpy's": "{ratio:.2f}",
-            "worst breach of a range, rad": "{breach_rad:.4f}",
-            "fastest joint, of its limit": "{speed:.2f}",
-            "standing foot, at most, mm": "{foot_mm:.1f}",
-            "foot below the floor, at most, mm": "{deep_mm:.1f}",
-            "some foot stands, % of frames": "{standing:.0f}",
-        },
+        {"stream": "{stream}", "frames": "{frames}", "cpu, p50, ms": "{p50:.2f}", "cpu, p99, ms": "{p99:.2f}",
+         "p50, of numpy's": "{ratio:.2f}", "worst breach of a range, rad": "{breach_rad:.4f}",
+         "fastest joint, of its limit": "{speed:.2f}", "standing foot, at most, mm": "{foot_mm:.1f}",
+         "foot below the floor, at most, mm": "{deep_mm:.1f}", "some foot stands, % of frames": "{standing:.0f}"},
         "`launch/robots/humanoid29.urdf`. cpu: the thread's processor time, which other processes do not "
         "lengthen, in frames that show somebody. numpy's: 30 steps of a Kalman filter of 44 states in numpy on the "
         f"same core, {numpy:.2f} ms; compare machines by the ratio. Foot: how far it is from where it came to stand.",
-    )
+    )  # fmt: skip

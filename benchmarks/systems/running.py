@@ -27,8 +27,6 @@ SILENCE_S = 30.0
 
 
 class Running(NamedTuple):
-    """Running nodes."""
-
     messages: Iterator[tuple[str, Message]]
     """what they publish, ``pose/world`` and ``diagnostics``, with its topic, as it arrives; ends when a node fails or
     all fall silent"""

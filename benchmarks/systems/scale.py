@@ -145,7 +145,6 @@ def clean_rate(recording: Path) -> dict[str, float]:
 
 
 def run(bench: Bench) -> Result:
-    """Measure streams per core, and recordings cleaned per hour, on this machine."""
     periods = round((2.0 if bench.quick else 10.0) * 30)
     frames = recorded()[:600]
     served = [serve(frames, clients, periods, bench.progress.track) for clients in CLIENTS]

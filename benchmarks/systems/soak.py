@@ -85,13 +85,8 @@ ROS_PORTS = range(7400 + 250 * ROS_DOMAIN, 7400 + 250 * ROS_DOMAIN + 30)
 
 @dataclass
 class Replayed:
-    """Total differences of replays with faults, for one topic.
-
-    Attributes:
-        lost, twice, deviating: numbers of frames.
-        furthest_m: largest deviation of a joint.
-        longest_s: longest run of deviating frames.
-    """
+    """Total differences of replays with faults, for one topic: numbers of frames, largest deviation of a joint, and
+    longest run of deviating frames."""
 
     frames: int = 0
     lost: int = 0
@@ -200,11 +195,8 @@ def _compare(expected: dict[int, list[Any]], got: dict[int, list[Any]], found: R
 def live(
     folder: Path, seconds: float, random_: random.Random
 ) -> tuple[dict[str, list[float]], dict[str, dict[str, int]], list[str]]:
-    """Process a live stream with faults.
-
-    Returns:
-        Seconds without poses after each fault; what became of each node's frames; and what does not add up.
-    """
+    """Process a live stream with faults. Returns seconds without poses after each fault; what became of each node's
+    frames; and what does not add up."""
     _write(folder / "stepping", _stepping(list(islice(crowd(recorded(), 1), FRAMES))))
     gaps: dict[str, list[float]] = defaultdict(list)
     optional = {"foxglove": "foxglove", "ros2_bridge": "cyclonedds"}
@@ -389,17 +381,11 @@ def _send(nodes: Running, name: str, with_: signal.Signals) -> None:
 
 def _replays_table(found: dict[str, Replayed], kills: dict[str, int]) -> Table:
     return Table(
-        name="soak-replays",
-        title="A replay that is to lose nothing, with faults",
-        columns=["topic", "frames", "lost", "twice", "deviating", "furthest, mm", "longest, s"],
-        rows=[
-            [
-                topic, *map(str, (f.frames, f.lost, f.twice, f.deviating)),
-                f"{1e3 * f.furthest_m:.1f}", f"{f.longest_s:.1f}",
-            ]
-            for topic, f in found.items()
-        ],
-        note=f"Against a replay without: {', '.join(f'{name} {n} times' for name, n in sorted(kills.items()))}.",
+        "soak-replays", "A replay that is to lose nothing, with faults",
+        ["topic", "frames", "lost", "twice", "deviating", "furthest, mm", "longest, s"],
+        [[topic, *map(str, (f.frames, f.lost, f.twice, f.deviating)), f"{1e3 * f.furthest_m:.1f}",
+          f"{f.longest_s:.1f}"] for topic, f in found.items()],
+        f"Against a replay without: {', '.join(f'{name} {n} times' for name, n in sorted(kills.items()))}.",
     )  # fmt: skip
 
 
@@ -407,14 +393,11 @@ def _live_table(gaps: dict[str, list[float]], counts: dict[str, dict[str, int]])
     published = sum(row["published"] for row in counts.values())
     causes = {cause: sum(row[cause] for row in counts.values()) for cause in ("in", "lost", "expired", "late", "away")}
     return Table(
-        name="soak-live",
-        title="A live stream with faults: seconds without pose/world",
-        columns=["fault", "p50", "p95", "longest", "times"],
-        rows=[
-            [fault, *(f"{q:.2f}" for q in np.percentile(found, (50, 95, 100))), str(len(found))]
-            for fault, found in sorted(gaps.items())
-        ],
-        note=f"Of {published:,} messages published to the nodes, {', '.join(f'{n:,} {c}' for c, n in causes.items())}: "
+        "soak-live", "A live stream with faults: seconds without pose/world",
+        ["fault", "p50", "p95", "longest", "times"],
+        [[fault, *(f"{q:.2f}" for q in np.percentile(found, (50, 95, 100))), str(len(found))]
+         for fault, found in sorted(gaps.items())],
+        f"Of {published:,} messages published to the nodes, {', '.join(f'{n:,} {c}' for c, n in causes.items())}: "
         "worked on, lost in a full queue, older than they may be, dropped for a newer one, and published while nobody "
         "of that name was there.",
-    )
+    )  # fmt: skip

@@ -108,7 +108,7 @@ def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
     if not found and any(path.suffix in SUFFIXES for path in ([mocap] if mocap.is_file() else mocap.rglob("*"))):
         found = [(mocap, s) for s in DATA_SETS if s.name == "own"]
     if not found:
-        known = ", ".join(s.files.removesuffix(r"\b.*") for s in DATA_SETS)
+        known = ", ".join(s.files for s in DATA_SETS)
         raise LaunchError(f"expected {', '.join(SUFFIXES)} or files named {known} in '{mocap}', found none")
     return found
 

@@ -60,11 +60,8 @@ def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np
     """CMU clips as root translations and exponential maps (``cmu_expmap.npz``).
 
     The archive's own positions are ignored: its offsets are those of the BVH conversion, which lost the thorax and a
-    third of the forearm. These are restored here.
-
-    Yields:
-        For each clip: the share of clips read, its name, frames per second, and positions (T, J, 3) metres, y up, of
-            the joints of the rig ``cmu_bvh``.
+    third of the forearm. These are restored here. Yields for each clip the share of clips read, its name, frames per
+    second, and positions (T, J, 3) metres, y up, of the joints of the rig ``cmu_bvh``.
     """
     with open_npz(file, "names", "parents", "offsets_m", "fps") as archive:
         joints = [str(n).replace("HeadEnd", "Head_end") for n in archive["names"]]
@@ -140,17 +137,10 @@ def read_asf(text: str) -> Asf:
 
 @documented
 def read_amc(text: str, skeleton: Asf) -> NDArray[np.float64]:
-    """Read an Acclaim motion.
+    """Read an Acclaim motion, (T, J, 3) metres in the axes of the subject's skeleton (y up in CMU's).
 
-    Args:
-        text: the file's contents. It does not tell its frame rate; CMU's are 120 Hz.
-        skeleton: of the same subject.
-
-    Returns:
-        (T, J, 3) metres, the skeleton's axes (y up in CMU's).
-
-    Raises:
-        MotionError: it is no AMC, or its bones are not the skeleton's.
+    The file does not tell its frame rate; CMU's are 120 Hz. Raises MotionError if it is no AMC, or its bones are not
+    the skeleton's.
     """
     angles = _frames(text)
     frames = len(angles["root"]) if "root" in angles else 0

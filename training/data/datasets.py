@@ -83,12 +83,10 @@ Use = Literal["default", "research", "measure"]
 
 @dataclass(frozen=True)
 class DataSet:
-    """A source of motion."""
-
     name: str
     """name of the source"""
     files: str
-    """regular expression of the names of its files or folders"""
+    """regular expression of the first word of the names of its files or folders"""
     weights: Use
     """weights that it may train"""
     read: Callable[[Path, Progress], Iterator[Clip | Dropped]]
@@ -97,8 +95,7 @@ class DataSet:
     """assigns a clip to training, validation or test"""
 
     def matches(self, path: Path) -> bool:
-        """Whether a file or folder contains it, by its name."""
-        return re.fullmatch(self.files, path.name) is not None
+        return re.match(rf"{self.files}\b", path.name) is not None
 
 
 def _read_cmu_amc(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
@@ -117,8 +114,6 @@ def _repeat(name: str, source: str) -> Dropped:
 
 
 class _Origin(NamedTuple):
-    """Origin of a recording, from its path and skeleton."""
-
     name: str
     subject: str
     action: str = ""
@@ -214,74 +209,36 @@ def _read_ui_prmd(path: Path, progress: Progress) -> Iterator[Clip | Dropped]:
         progress((i + 1) / len(pairs))
 
 
-def _held_out(test: bool) -> Split:
-    return "val" if test else "train"
+def _validates(*people: str, others: Split = "train") -> Callable[[Clip], Split]:
+    return lambda clip: "val" if clip.subject in people else others
 
 
 def _own_split(clip: Clip) -> Split:
-    """Return the split of a user's own recording, from its folders."""
     folders = PurePosixPath(clip.name).parts
     return "val" if "val" in folders else "test" if "test" in folders else "train"
 
 
-CMU_VALIDATION = frozenset({"02"})
-"""Validation subjects of the AMC recordings. All ten recordings of subject 02 are in this archive."""
-
-DANCE_TRAINING = frozenset({"salsa"})
-"""Kinds for training, and so people; the others (martial arts, Indian dance) are the test split."""
-
-REACTIDLE_VALIDATION = ("013", "014", "015")
-"""Validation subjects."""
-
-BANDAI_VALIDATION = "-17.2 93.2 453.0"
-"""Hips of the rest pose in the validation session, one of the second set's three sessions, 807 clips."""
-
 AMASS_VALIDATION = frozenset({"HumanEva", "MPI_HDM05", "HDM05", "SFU", "MPI_mosh", "MoSh"})
 """Folders of the parts on which HM-VAE validates (names in both AMASS releases)."""
 
-DANCEDB_VALIDATION = frozenset({"Andria", "Elena"})
-"""Validation dancers; Anna, Olivia and Theodora are the test split."""
-
-LAFAN1_VALIDATION = "subject1"
-"""Validation actor; subjects 2 to 4 are the test split."""
-
 DATA_SETS: tuple[DataSet, ...] = (
-    # The unnamed expmap clips may be of subjects 06 and 07: all of these train.
-    DataSet(
-        "CMU (AMC)", r"cmu_amc\b.*", "default", _read_cmu_amc,
-        lambda clip: _held_out(clip.subject in CMU_VALIDATION),
-    ),
-    _bvh("CMU (BVH)", r"cmu_bvh\b.*", "default", CMU_LICENCE, _origin_cmu, lambda _: "train"),
-    DataSet("CMU (expmap)", r"cmu_expmap\b.*", "default", _read_cmu_expmap, lambda _: "train"),
-    _bvh("CMU (more)", r"cmu_more\b.*", "default", CMU_LICENCE, _origin_cmu_more, lambda _: "train"),
-    _bvh(
-        "CMU (dance)", r"cmu_dance\b.*", "default", CMU_LICENCE, _origin_kind,
-        lambda clip: "train" if clip.subject in DANCE_TRAINING else "test",
-    ),
-    _bvh(
-        "ReActIdle", r"reactidle\b.*", "default", "MIT", _origin_reactidle,
-        lambda clip: _held_out(clip.subject in REACTIDLE_VALIDATION),
-    ),
-    DataSet(
-        "UI-PRMD (Vicon)", r"ui_prmd\b.*", "default", _read_ui_prmd,
-        lambda clip: _held_out(clip.subject in VALIDATION_SUBJECTS),
-    ),
-    _bvh(
-        "Bandai-Namco", r"bandai_\d\b.*", "research", "CC-BY-NC-4.0", _origin_bandai,
-        lambda clip: _held_out(clip.subject == BANDAI_VALIDATION),
-    ),
-    DataSet(
-        "AMASS", r"amass\b.*", "research", _read_amass,
-        lambda clip: _held_out(not AMASS_VALIDATION.isdisjoint(PurePosixPath(clip.name).parts)),
-    ),
-    _bvh(
-        "DanceDB", r"dancedb\b.*", "measure", "DanceDB: research", _origin_dancedb,
-        lambda clip: "val" if clip.subject in DANCEDB_VALIDATION else "test",
-    ),
-    _bvh(
-        "LAFAN1", r"lafan1\b.*", "measure", "CC-BY-NC-ND-4.0", _origin_lafan1,
-        lambda clip: "val" if clip.subject == LAFAN1_VALIDATION else "test",
-    ),
-    DataSet("own", r"own\b.*", "default", read_own, _own_split),
+    # All of subject 02 is in this archive. The unnamed expmap clips may be of subjects 06 and 07: all of these train.
+    DataSet("CMU (AMC)", "cmu_amc", "default", _read_cmu_amc, _validates("02")),
+    _bvh("CMU (BVH)", "cmu_bvh", "default", CMU_LICENCE, _origin_cmu, _validates()),
+    DataSet("CMU (expmap)", "cmu_expmap", "default", _read_cmu_expmap, _validates()),
+    _bvh("CMU (more)", "cmu_more", "default", CMU_LICENCE, _origin_cmu_more, _validates()),
+    # kinds, and so people; the others are martial arts and Indian dance
+    _bvh("CMU (dance)", "cmu_dance", "default", CMU_LICENCE, _origin_kind,
+         lambda clip: "train" if clip.subject == "salsa" else "test"),
+    _bvh("ReActIdle", "reactidle", "default", "MIT", _origin_reactidle, _validates("013", "014", "015")),
+    DataSet("UI-PRMD (Vicon)", "ui_prmd", "default", _read_ui_prmd, _validates(*VALIDATION_SUBJECTS)),
+    # one of the second set's three sessions, 807 clips, by the hips of its rest pose
+    _bvh("Bandai-Namco", r"bandai_\d", "research", "CC-BY-NC-4.0", _origin_bandai, _validates("-17.2 93.2 453.0")),
+    DataSet("AMASS", "amass", "research", _read_amass,
+            lambda clip: "train" if AMASS_VALIDATION.isdisjoint(PurePosixPath(clip.name).parts) else "val"),
+    _bvh("DanceDB", "dancedb", "measure", "DanceDB: research", _origin_dancedb,
+         _validates("Andria", "Elena", others="test")),
+    _bvh("LAFAN1", "lafan1", "measure", "CC-BY-NC-ND-4.0", _origin_lafan1, _validates("subject1", others="test")),
+    DataSet("own", "own", "default", read_own, _own_split),
 )  # fmt: skip
 """All data sets, in the order of preparation. A user's own recordings in a folder ``own`` train the default set."""

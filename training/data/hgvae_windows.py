@@ -40,8 +40,6 @@ class Windows:
 
 
 class Batch(NamedTuple):
-    """Windows as tensors."""
-
     x: Tensor
     """(B, 66, T) tracks minus the model's mean, in units of `SCALE`; interpolated where unobserved"""
     observed: Tensor

@@ -258,11 +258,8 @@ def write_prepared(prepared: Sequence[Prepared], path: Path) -> None:
 
 @contextmanager
 def whole(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that is ``path`` after the block. If it cannot be written, what was there before stays.
-
-    Raises:
-        OSError: it cannot be written, for example because the disk is full.
-    """
+    """Open a file that is ``path`` after the block. If it cannot be written, what was there before stays. Raises
+    OSError if it cannot be written, for example because the disk is full."""
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:

@@ -58,10 +58,8 @@ Progress = Callable[[float], None]
 def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterator[tuple[str, bytes]]:
     """Yield names and contents of files with these suffixes in an archive (.tar, .tar.xz, ...), a folder, or a file.
 
-    Archives are read as a stream, in their own order; folders are read by name.
-
-    Raises:
-        MotionError: the file is no archive, or is truncated.
+    Archives are read as a stream, in their own order; folders are read by name. Raises MotionError if the file is no
+    archive, or is truncated.
     """
     if path.is_file() and path.suffix not in suffixes:
         size = path.stat().st_size
@@ -82,11 +80,8 @@ def members(path: Path, suffixes: tuple[str, ...], progress: Progress) -> Iterat
 
 
 def bvh_motion(text: str) -> tuple[Bvh, Skeleton, Floats]:
-    """A BVH file, its skeleton, and the positions (T, J, 3) of that skeleton's joints, metres, z up.
-
-    Raises:
-        MotionError: it cannot be read, or no body is recognised in it.
-    """
+    """A BVH file, its skeleton, and the positions (T, J, 3) of that skeleton's joints, metres, z up. Raises MotionError
+    if it cannot be read, or no body is recognised in it."""
     bvh = read_bvh(text)
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, UNDESCRIBED)
     positions = _select(rig, bvh.joints, bvh.positions(rig.lost_bones))
@@ -140,12 +135,10 @@ def amc_motions(path: Path, progress: Progress) -> Iterator[tuple[str, Floats | 
 
 
 def folder_of(name: str) -> str:
-    """Return the folder of a file in an archive."""
     return PurePosixPath(name).parent.as_posix()
 
 
 def stem_of(name: str) -> str:
-    """Return a file's name without folder and suffix."""
     return PurePosixPath(name).stem
 
 

@@ -60,7 +60,6 @@ class Pairs:
     """(C,) the person"""
 
     def of(self, subjects: Collection[str]) -> Pairs:
-        """Return the recordings of these subjects."""
         clips = np.flatnonzero(np.isin(self.subject, list(subjects)))
         rows = np.concatenate([np.arange(*self.start[c : c + 2]) for c in clips])
         lengths = np.diff(self.start)[clips]
@@ -71,13 +70,8 @@ class Pairs:
 def write_arrays(mocap: Path, out: Path) -> Path:
     """Read the recordings under ``mocap`` that are licensed for products; write ``motion-SPLIT.npz`` and ``pairs.npz``.
 
-    Recordings of the test split are excluded. Arrays that are there are kept.
-
-    Returns:
-        ``out``.
-
-    Raises:
-        MotionError: there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
+    Recordings of the test split are excluded. Arrays that are there are kept. Returns ``out``. Raises MotionError if
+    there are none of one split, or no pairs of Kinect and Vicon (``ui_prmd.npz``).
     """
     if (out / "pairs.npz").is_file():
         return out

@@ -77,15 +77,13 @@ class CompletionNet(nn.Module):
 
     It predicts corrections of the interpolated joints of windows of ``frames``, with their variance.
 
-    HG-VAE's own encoder learns this badly. Its node is one coordinate of one joint, all nodes share their weights, and
-    the likelihood of joints observed to the millimetre outweighs that of hidden joints with errors of decimetres. Here,
-    a node is a patch of the window in time and its features are the whole body, so a knee follows from hip, ankle and
-    the other leg.
+    HG-VAE's own encoder learns this badly: its node is one coordinate of one joint, and joints observed to the
+    millimetre outweigh hidden ones with errors of decimetres. Here, a node is a patch of the window in time and its
+    features are the whole body, so a knee follows from hip, ankle and the other leg.
 
-    A resting limb mostly stays at rest. The interpolation relative to its parent (`prior.models.hgvae.features`) is
-    then accurate to the millimetre, which no network is. The network's correction is therefore fused with that
-    interpolation by inverse variances. The interpolation's variance grows with the time from an observation, and with
-    how much this joint of this person moved while it was observed.
+    The interpolation of a resting limb relative to its parent (`prior.models.hgvae.features`) is accurate to the
+    millimetre, which no network is. So the network's correction is fused with it by inverse variances. The
+    interpolation's grows with the time from an observation, and with how much the joint moved while it was observed.
     """
 
     def __init__(self, frames: int, config: CompletionConfig) -> None:
@@ -157,11 +155,9 @@ def _by_track(nodes: Tensor, tracks: int) -> Tensor:
 class FaultNet(nn.Module):
     """Predicts the log odds that a joint's error is larger than the sensor's noise explains.
 
-    The likelihood of a window under a generative model distinguishes noise from motion. It does not distinguish a
-    frozen hand from a resting one, and takes a dance for a fault. The most powerful test between two hypotheses is
-    their likelihood ratio (Neyman and Pearson), which a classifier learns. This one reads the observations and HG-VAE's
-    reconstruction with its deviation. It is trained on clean motion and on motion with tracking faults
-    (`training.recipes.hgvae_faults`).
+    A window's likelihood under a generative model does not tell a frozen hand from a resting one, and takes a dance for
+    a fault. The most powerful test is the likelihood ratio (Neyman and Pearson), which a classifier learns. This one
+    reads the observations and HG-VAE's reconstruction with its deviation; `training.recipes.hgvae_faults` trains it.
     """
 
     def __init__(self, config: FaultNetConfig) -> None:
@@ -188,25 +184,14 @@ def load_fault_net(weights: str) -> FaultNet:
 class AttentionLayer(nn.Module):
     """Pre-norm multi-head attention between nodes, and a feed-forward network, each with a residual connection.
 
-    Args:
-        width: number of features of a node.
-        heads: number of attention heads.
-        widened: width of the feed-forward network.
-        reach: distance up to which scores have learned biases of relative position; None for none.
-        approximate: approximation of the GELU, as torch names it.
-        dropout: share of the branches' outputs that training drops.
+    Nodes have ``width`` features, the feed-forward network ``widened``. Up to a distance of ``reach``, scores have
+    learned biases of relative position. ``dropout`` is the share of the branches' outputs that training drops.
     """
 
     def __init__(
-        self,
-        width: int,
-        heads: int,
-        widened: int,
-        *,
-        reach: int | None = None,
-        approximate: str = "none",
+        self, width: int, heads: int, widened: int, *, reach: int | None = None, approximate: str = "none",
         dropout: float = 0.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.heads, self.approximate, self.dropout = heads, approximate, nn.Dropout(dropout)
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)

@@ -65,8 +65,6 @@ class Gaussian(NamedTuple):
 
 
 class HGVAEOutput(NamedTuple):
-    """Output of one pass through the model."""
-
     tracks: Gaussian
     """p(x | z), mean and log-variance (B, N, T), in units of `SCALE`"""
     kl: Tensor

@@ -43,8 +43,6 @@ FIRST_GATE = -4.0
 
 @dataclass(frozen=True)
 class MixtureConfig:
-    """Layer widths."""
-
     own: int = 32
     """number of features of each joint"""
     body: int = 384

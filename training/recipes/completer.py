@@ -117,7 +117,6 @@ _BETWEEN = np.setdiff1d(np.arange(22), _ENDS)
 
 
 def train_completer(options: TrainingOptions, config: CompleterConfig | None = None) -> Path:
-    """Train the completer with these sizes on prepared motion; returns the path of the weights."""
     train, val = options.motion()
     windows, sizes = SpeedWeightedWindows(train), config or CompleterConfig()
 
@@ -285,12 +284,8 @@ PROTOCOL = (10, 1)
 
 @torch.no_grad()
 def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) -> dict[str, float]:
-    """Errors on unseen people.
-
-    Returns:
-        for gaps of 15 and 30 frames, ``val 15 of line`` the error of joints as a share of slerp's and lerp's; ``val
-        legs mm`` that of knees, ankles and feet never seen.
-    """
+    """Errors on unseen people: ``val 15 of line`` in gaps of 15 frames (and 30), as a share of slerp's and lerp's;
+    ``val legs mm`` of knees, ankles and feet never seen."""
     found = {}
     for gap in (15, 30):
         frames = sum(PROTOCOL) + gap

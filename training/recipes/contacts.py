@@ -41,8 +41,6 @@ OUTPUTS = 2 * len(CONTACT_JOINTS)
 
 @dataclass(frozen=True)
 class ContactConfig:
-    """Sizes."""
-
     hidden: int = 64
     """numbers that the network remembers of a body"""
 
@@ -194,7 +192,6 @@ def _tensor(values: NDArray[Any]) -> Tensor:
 
 
 def train_contacts(options: TrainingOptions) -> Path:
-    """Train the contact network on prepared motion at several speeds; returns the path of the weights."""
     motion = dict(zip(CLIPS, options.motion(flat=True), strict=True))
     train, val = (_pool(options.path("contacts").parent, motion[split], split, options.seed) for split in CLIPS)
 

@@ -107,10 +107,8 @@ def _network(model: HGVAE) -> CompletionNet:
 @torch.no_grad()
 def evaluate_completion(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
     """Evaluate on unseen people: RMS error along an axis of joints hidden as in training, and of 1 and 4 hidden joints.
-
-    Returns:
-        ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the error-to-sigma ratio of the first.
-    """
+    Returns ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the error-to-sigma ratio of the
+    first."""
     rng = np.random.default_rng(1)
     clean, sizes = val.draw(windows, model.config.frames, rng)
     bias_sigma = draw_bias_sigma(windows, rng)
@@ -152,9 +150,7 @@ def train_hgvae(options: TrainingOptions) -> Path:
     """Train HG-VAE on prepared motion, after its completion network and before its fault network.
 
     With ``options.start``, the learning rate is halved, and the fault network starts from the one beside those weights.
-
-    Returns:
-        The path of the weights.
+    Returns the path of the weights.
     """
     weights, seed, start, path = options.weights, options.seed, options.start, options.path("hgvae")
     iterations = options.iterations or ITERATIONS
@@ -184,10 +180,8 @@ def train_hgvae(options: TrainingOptions) -> Path:
 def train_completion(options: TrainingOptions) -> Path:
     """Train the completion network alone, within the weights ``options.start`` or those that ship.
 
-    The fault network and the calibration of the anomaly score are copied: they are about observed joints.
-
-    Returns:
-        The path of the weights.
+    The fault network and the calibration of the anomaly score are copied: they are about observed joints. Returns the
+    path of the weights.
     """
     start, path = options.start or options.weights, options.path("hgvae")
     train, val = (Windows(motion) for motion in options.motion())
@@ -245,13 +239,10 @@ def evidence(drawn: HGVAEOutput, target: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
-    """Evaluate on unseen people: evidence lower bound, reconstruction error, and error of completed entries.
-
-    Returns:
-        ``ELBO`` and its ``log p(x|z)``, nats per entry; ``val mm``, the mean joint error of whole windows; ``hidden
-        mm``, that of joints hidden as in training; ``guess mm``, that of the completion network alone; ``hidden
-        found/stated``, the error-to-sigma ratio of the hidden joints.
-    """
+    """Evaluate on unseen people: evidence lower bound, reconstruction error, and error of completed entries. Returns
+    ``ELBO`` and its ``log p(x|z)``, nats per entry; ``val mm``, the mean joint error of whole windows; ``hidden mm``,
+    that of joints hidden as in training; ``guess mm``, that of the completion network alone; ``hidden found/stated``,
+    the error-to-sigma ratio of the hidden joints."""
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)
     whole = Batch.of(model, positions, positions, sizes)

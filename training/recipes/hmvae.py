@@ -56,8 +56,6 @@ kernel, twice the dimensions of z_l (for fast motion), and encoding about the me
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Hyperparameters of a VAE of windows."""
-
     iterations: int
     """number of optimiser steps"""
     batch: int
@@ -82,7 +80,6 @@ LONG = Hyperparameters(12_000, 16, 1e-3, 100.0, strides=(1, 1, 2, 3), speed_weig
 
 
 def train_hmvae(options: TrainingOptions) -> Path:
-    """Train HM-VAE on prepared motion; returns the path of the weights."""
     return _train("hmvae", HMVAEConfig(about_mean=True), "window 8 about its mean pose", SHORT, options)
 
 
@@ -182,11 +179,8 @@ def _loss(
 
 @torch.no_grad()
 def evaluate_hmvae(model: HMVAE, motion: MotionSet, frames: int = 16_384) -> dict[str, float]:
-    """Evaluate the reconstruction from the posterior's mean on unseen people.
-
-    Returns:
-        ``val MPJPE mm`` over whole windows, root-centred, and ``val centre mm``, of the frame that refinement keeps.
-    """
+    """Evaluate the reconstruction from the posterior's mean on unseen people. Returns ``val MPJPE mm`` over whole
+    windows, root-centred, and ``val centre mm``, of the frame that refinement keeps."""
     window = model.window
     rows = motion.all_windows(window, step=1)
     rows = rows[:: max(len(rows) * window // frames, 1)]

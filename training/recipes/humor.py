@@ -75,7 +75,6 @@ class Sequences:
 
     @classmethod
     def of(cls, motion: MotionSet) -> Sequences:
-        """Return all sequences of a motion."""
         ends = zip(motion.clip_start, motion.clip_start[1:], strict=False)
         clips = [motion.positions[a:b].numpy() for a, b in ends]
         load, rest = (
@@ -123,7 +122,6 @@ class Batch:
 
 
 def train_humor(options: TrainingOptions) -> Path:
-    """Train the transition model on prepared motion; returns the path of the weights."""
     train, val = options.motion(flat=True)
     config = HumorConfig()
     sequences = Sequences.of(train)
@@ -217,13 +215,10 @@ def _own_states(model: HumorNet, batch: Batch, own: float, rng: Rng) -> State:
 
 
 def evaluate_humor(model: HumorNet, unseen: Sequences) -> dict[str, float]:
-    """Evaluate reconstruction and prediction on unseen people, over the seconds with the longest travel.
-
-    Returns:
-        ``val reconstruction mm``, the mean joint error at the end of a one-second rollout with the posterior's means;
-        ``val prediction mm``, the error after half a second with the prior's means; ``val rest F1`` of heels and toes
-        in the first.
-    """
+    """Evaluate reconstruction and prediction on unseen people, over the seconds with the longest travel. Returns ``val
+    reconstruction mm``, the mean joint error at the end of a one-second rollout with the posterior's means; ``val
+    prediction mm``, the error after half a second with the prior's means; ``val rest F1`` of heels and toes in the
+    first."""
     steps = int(FPS)
     rows = unseen.motion.all_windows(steps + 2, steps)
     path = unseen.motion.positions[rows[:, -1], 0] - unseen.motion.positions[rows[:, 0], 0]

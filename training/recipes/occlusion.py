@@ -79,8 +79,6 @@ _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
 
 @dataclass(frozen=True)
 class OcclusionConfig:
-    """Sizes."""
-
     hidden: int = 96
     """of each layer"""
 

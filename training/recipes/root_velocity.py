@@ -114,8 +114,6 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _Windows:
-    """Input and targets of the network."""
-
     features: Tensor
     """(B, T, FEATURES) input"""
     turn: Tensor
@@ -127,7 +125,6 @@ class _Windows:
 
 
 def train_trajectory(options: TrainingOptions) -> Path:
-    """Train the trajectory network on prepared motion; returns the path of the weights."""
     train, val = options.motion(flat=True)
     starts, chances = _chances(train)
 
@@ -156,7 +153,6 @@ def _chances(motion: MotionSet) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sample(motion: MotionSet, starts: np.ndarray, chances: np.ndarray, count: int, rng: Rng) -> _Motion:
-    """Draw random windows, with varied speeds and sizes of people."""
     rows = rng.choice(starts, size=count, p=chances)[:, None] + np.arange(_SPAN)
     times = np.exp(rng.uniform(np.log(RATES[0]), np.log(RATES[1]), (count, 1))) * np.arange(WINDOW + 2)
     frames = torch.from_numpy(np.take_along_axis(rows, times.astype(np.int64), axis=1))
@@ -247,12 +243,8 @@ def _validate(model: TrajectoryNet, motion: MotionSet, count: int) -> tuple[Root
 
 
 def evaluate_trajectory(model: TrajectoryNet, motion: MotionSet) -> dict[str, float]:
-    """Evaluate the errors on unseen people.
-
-    Returns:
-        ``val velocity m/s``, the RMS velocity error along an axis; ``val 1 s drift cm``, that of the horizontal
-        trajectory after one second.
-    """
+    """Evaluate the errors on unseen people. Returns ``val velocity m/s``, the RMS velocity error along an axis; ``val 1
+    s drift cm``, that of the horizontal trajectory after one second."""
     off, in_world = _errors(*_validate(model, motion, count=512))
     drift = in_world[:, :30, :2].sum(dim=1).norm(dim=-1) * FRAME_S * 100
     return {

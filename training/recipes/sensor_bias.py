@@ -220,7 +220,6 @@ def _features_and_missing(
 
 
 def _hide(x: Tensor, generator: np.random.Generator) -> Tensor:
-    """Hide a few joints in some of the frames."""
     hidden = (generator.random((len(x), 1)) < HIDE) & (generator.random((len(x), 22)) < 0.2)
     mask = torch.from_numpy(hidden)
     return torch.cat(
