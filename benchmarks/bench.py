@@ -29,10 +29,8 @@ Parameters = dict[str, float]
 
 @dataclass(frozen=True)
 class Tuned:
-    parameters: Parameters
-    """parameters with the least loss"""
-    tried: list[dict[str, float]]
-    """every evaluated point, with its figures"""
+    parameters: Parameters  # parameters with the least loss
+    tried: list[dict[str, float]]  # every evaluated point, with its figures
 
 
 def loss(figures: Mapping[str, float]) -> float:
@@ -78,16 +76,11 @@ RECURRENT = "GRU of the whole body"
 
 @dataclass(frozen=True)
 class Bench:
-    quick: bool
-    """use fewer clips, points and steps, to check that everything works"""
-    mocap: Path | None
-    """folder with ui_prmd.npz, or None"""
-    data: Path
-    """prepared.npz; if it does not exist, simulated people are used instead"""
-    progress: Progress
-    """progress bars"""
-    split: str = "val"
-    """split of the prepared motion to score: ``val`` to choose, ``test`` to report"""
+    quick: bool  # use fewer clips, points and steps, to check that everything works
+    mocap: Path | None  # folder with ui_prmd.npz, or None
+    data: Path  # prepared.npz; if it does not exist, simulated people are used instead
+    progress: Progress  # progress bars
+    split: str = "val"  # split of the prepared motion to score: ``val`` to choose, ``test`` to report
 
     @property
     def delays(self) -> tuple[int, ...]:
@@ -142,14 +135,10 @@ class Answer(NamedTuple):
 
 
 class Methods(NamedTuple):
-    baselines: Sequence[Baseline]
-    """baselines without training"""
-    product: Mapping[str, PriorSettings]
-    """steadypose's variants"""
-    delays: Sequence[int]
-    """frames"""
-    networks: bool = True
-    """whether to include the baselines trained here"""
+    baselines: Sequence[Baseline]  # baselines without training
+    product: Mapping[str, PriorSettings]  # steadypose's variants
+    delays: Sequence[int]  # frames
+    networks: bool = True  # whether to include the baselines trained here
 
 
 def baselines_of(baselines: Sequence[Baseline], delays: Sequence[int]) -> Iterator[tuple[Baseline, int]]:

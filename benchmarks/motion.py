@@ -24,20 +24,13 @@ from steadypose.training.data.dataset import MotionSet
 class MotionClips:
     """Clips of equal length at 30 Hz, side by side."""
 
-    positions: Floats
-    """(T, C, 22, 3) metres, world, z up, floor at 0"""
-    rotations: Floats
-    """(T, C, 22, 3, 3) local"""
-    offsets: Floats
-    """(C, 22, 3) metres, each person's bones"""
-    contacts: NDArray[np.bool_]
-    """(T, C, 8) labels of `CONTACT_JOINTS`"""
-    source: dict[str, Any]
-    """description for the results file"""
-    person: NDArray[np.str_]
-    """(C,) who moves (`benchmarks.scores` averages over people)"""
-    data_set: NDArray[np.str_]
-    """(C,) data set of each; tables have a column for each, before their mean"""
+    positions: Floats  # (T, C, 22, 3) metres, world, z up, floor at 0
+    rotations: Floats  # (T, C, 22, 3, 3) local
+    offsets: Floats  # (C, 22, 3) metres, each person's bones
+    contacts: NDArray[np.bool_]  # (T, C, 8) labels of `CONTACT_JOINTS`
+    source: dict[str, Any]  # description for the results file
+    person: NDArray[np.str_]  # (C,) who moves (`benchmarks.scores` averages over people)
+    data_set: NDArray[np.str_]  # (C,) data set of each; tables have a column for each, before their mean
 
     @property
     def stamps_s(self) -> Floats:

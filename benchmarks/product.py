@@ -51,18 +51,12 @@ imputed."""
 class Cleaned:
     """The content of ``pose/clean``."""
 
-    stamps_s: Floats
-    """(T',) seconds, on the prior's 30 Hz grid"""
-    positions: Floats
-    """(T', C, 22, 3) metres; NaN without an estimate"""
-    sigma: Floats
-    """(T', C, 22) metres, the predicted standard deviation along an axis"""
-    anomaly: Floats
-    """(T', C) score, NaN without an estimate"""
-    flagged: NDArray[np.bool_]
-    """(T', C) whether it was flagged as an anomaly"""
-    rotations: Floats
-    """(T', C, 22, 4) local, xyzw"""
+    stamps_s: Floats  # (T',) seconds, on the prior's 30 Hz grid
+    positions: Floats  # (T', C, 22, 3) metres; NaN without an estimate
+    sigma: Floats  # (T', C, 22) metres, the predicted standard deviation along an axis
+    anomaly: Floats  # (T', C) score, NaN without an estimate
+    flagged: NDArray[np.bool_]  # (T', C) whether it was flagged as an anomaly
+    rotations: Floats  # (T', C, 22, 4) local, xyzw
 
 
 def run(settings: PriorSettings, seen: Floats, stamps_s: Floats, delay: int, skeleton: str = "smpl22") -> Cleaned:

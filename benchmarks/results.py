@@ -34,16 +34,11 @@ NONE = "–"
 class Table:
     """A table of a result. The first column is text, the others are figures."""
 
-    name: str
-    """name in the markers between which the table is written"""
-    title: str
-    """what is measured, with units"""
-    columns: list[str]
-    """headers"""
-    rows: list[list[str]]
-    """cells, ready to print"""
-    note: str = ""
-    """conditions that a reader must know"""
+    name: str  # name in the markers between which the table is written
+    title: str  # what is measured, with units
+    columns: list[str]  # headers
+    rows: list[list[str]]  # cells, ready to print
+    note: str = ""  # conditions that a reader must know
 
     @classmethod
     def of(
@@ -57,14 +52,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Result:
-    tables: list[Table]
-    """tables to read; the first is printed first"""
-    data: dict[str, Any]
-    """figures for programs"""
-    figures: Mapping[str, Figure] = field(default_factory=dict)
-    """plots by file name"""
-    wrong: Sequence[str] = ()
-    """violated requirements, a line each; the command then fails"""
+    tables: list[Table]  # tables to read; the first is printed first
+    data: dict[str, Any]  # figures for programs
+    figures: Mapping[str, Figure] = field(default_factory=dict)  # plots by file name
+    wrong: Sequence[str] = ()  # violated requirements, a line each; the command then fails
 
 
 def show(table: Table, console: Console) -> None:

@@ -48,14 +48,10 @@ _HEIGHT = {joint: float(REST_HEIGHT[CONTACT_JOINTS.index(J[joint])]) for _, join
 class Trial(NamedTuple):
     """One stream of 30 Hz."""
 
-    kind: str
-    """one of `KINDS`"""
-    joints: Floats
-    """(T, 22, 3) metres, floor at 0; NaN except for ankles and toes"""
-    loaded: Bools
-    """(T, 2) whether the left and the right foot bear load"""
-    valid: Bools
-    """(T, 2) where the plates measure"""
+    kind: str  # one of `KINDS`
+    joints: Floats  # (T, 22, 3) metres, floor at 0; NaN except for ankles and toes
+    loaded: Bools  # (T, 2) whether the left and the right foot bear load
+    valid: Bools  # (T, 2) where the plates measure
 
 
 def read_trials(path: Path) -> list[Trial]:

@@ -49,12 +49,9 @@ POINTS = 200
 
 @dataclass(frozen=True)
 class Answer:
-    joints: Floats
-    """(T, 22, 3) metres, world"""
-    load: Floats | None = None
-    """(T, 8) probabilities, or None"""
-    seconds: float | None = None
-    """processor time; None for methods that process all clips together"""
+    joints: Floats  # (T, 22, 3) metres, world
+    load: Floats | None = None  # (T, 8) probabilities, or None
+    seconds: float | None = None  # processor time; None for methods that process all clips together
 
 
 def starts_of(cleaned: product.Cleaned, frames: int, ground: Callable[[Floats], float] | None = None) -> list[Start]:
@@ -92,14 +89,10 @@ def fitted(
 class Pictures:
     """A clip observed by a level camera."""
 
-    truth: Floats
-    """(T, 22, 3) metres, in a frame with z up and the camera at 0"""
-    seen: NDArray[np.bool_]
-    """(T, 22) which joints the detector detected"""
-    flat: Track
-    """its key points"""
-    deep: Track
-    """the key points with points of a depth camera"""
+    truth: Floats  # (T, 22, 3) metres, in a frame with z up and the camera at 0
+    seen: NDArray[np.bool_]  # (T, 22) which joints the detector detected
+    flat: Track  # its key points
+    deep: Track  # the key points with points of a depth camera
 
 
 def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Pictures:

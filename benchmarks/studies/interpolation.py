@@ -57,16 +57,11 @@ _FOOT_JOINTS = [CONTACT_JOINTS[k] for k in _FEET]
 class Truth(NamedTuple):
     """C clips of T frames, with the gap to be filled."""
 
-    positions: Floats
-    """(C, T, 22, 3) metres"""
-    rotations: Floats
-    """(C, T, 22, 3, 3) local"""
-    offsets: Floats
-    """(C, 22, 3) metres, bones"""
-    contacts: NDArray[np.bool_]
-    """(C, T, 8) labels of `CONTACT_JOINTS`"""
-    gap: slice
-    """frames of the gap"""
+    positions: Floats  # (C, T, 22, 3) metres
+    rotations: Floats  # (C, T, 22, 3, 3) local
+    offsets: Floats  # (C, 22, 3) metres, bones
+    contacts: NDArray[np.bool_]  # (C, T, 8) labels of `CONTACT_JOINTS`
+    gap: slice  # frames of the gap
 
     @classmethod
     def of(cls, clips: MotionClips, gap: int) -> Truth:

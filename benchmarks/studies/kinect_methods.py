@@ -196,14 +196,10 @@ Run = Callable[[Sequence[Clip]], tuple[list[Floats], list[Stated] | None]]
 
 @dataclass(frozen=True)
 class Method:
-    name: str
-    """name in tables"""
-    delay: int
-    """frames"""
-    run: Run
-    """what it does"""
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    """tuned parameters"""
+    name: str  # name in tables
+    delay: int  # frames
+    run: Run  # what it does
+    parameters: Mapping[str, float] = field(default_factory=dict)  # tuned parameters
 
 
 def run_filter(
@@ -242,14 +238,10 @@ def run_ours(clips: Sequence[Clip], settings: PriorSettings, delay: int) -> tupl
 class Kinect:
     """The methods, with each person left out in turn. What does not depend on the person is computed once."""
 
-    bench: Bench
-    """settings of the study"""
-    data: Path
-    """``ui_prmd.npz``"""
-    clips: Sequence[Clip]
-    """clips of all people"""
-    taught: Sequence[Clip]
-    """clips of all people from which baselines learn"""
+    bench: Bench  # settings of the study
+    data: Path  # ``ui_prmd.npz``
+    clips: Sequence[Clip]  # clips of all people
+    taught: Sequence[Clip]  # clips of all people from which baselines learn
     _answers: dict[tuple[str | float, ...], dict[str, tuple[Floats, Stated | None]]] = field(default_factory=dict)
 
     def tuned(self, on: Sequence[Clip]) -> dict[tuple[str, int], Tuned]:

@@ -28,14 +28,10 @@ FRAMES, SKIPPED = 240, 60
 class _Source(NamedTuple):
     """Location of recordings with rotations."""
 
-    name: str
-    """name of the source"""
-    archive: str
-    """its file"""
-    turns: Mapping[str, str]
-    """the file's joint that rotates with each canonical joint, left and middle"""
-    people: Mapping[str, tuple[str, ...]]
-    """marks in file names that identify the people of each split"""
+    name: str  # name of the source
+    archive: str  # its file
+    turns: Mapping[str, str]  # the file's joint that rotates with each canonical joint, left and middle
+    people: Mapping[str, tuple[str, ...]]  # marks in file names that identify the people of each split
 
 
 _LIMBS = {
@@ -77,14 +73,10 @@ SCORED = tuple(J[name] for name in JOINTS if not name.endswith(("foot", "wrist",
 class Clips(NamedTuple):
     """Clips side by side, 30 Hz."""
 
-    positions: Floats
-    """(T, C, 22, 3) metres, z up"""
-    orientations: Floats
-    """(T, C, 17, 3, 3) of `SCORED`, world from the file's joint"""
-    source: NDArray[np.str_]
-    """(C,) names"""
-    person: NDArray[np.str_]
-    """(C,) marks of their people"""
+    positions: Floats  # (T, C, 22, 3) metres, z up
+    orientations: Floats  # (T, C, 17, 3, 3) of `SCORED`, world from the file's joint
+    source: NDArray[np.str_]  # (C,) names
+    person: NDArray[np.str_]  # (C,) marks of their people
 
 
 def read(mocap: Path, split: str, most: int) -> Clips:

@@ -198,10 +198,8 @@ HORIZONS = (15, 30, 60)
 
 
 class Way(NamedTuple):
-    positions: Floats
-    """(T, 22, 3) metres"""
-    sigma: Floats
-    """(T, 3) metres, the root's standard deviation"""
+    positions: Floats  # (T, 22, 3) metres
+    sigma: Floats  # (T, 3) metres, the root's standard deviation
 
 
 Method = Callable[[Sequence[PoseClean]], Way]
@@ -230,12 +228,9 @@ METHODS: Mapping[str, Method] = {
 class Clip:
     """True motion at 30 Hz."""
 
-    positions: Floats
-    """(T, 22, 3) metres, world, floor at 0"""
-    rotations: Floats
-    """(T, 22, 4) xyzw, local"""
-    contacts: NDArray[np.bool_]
-    """(T, 8) labels"""
+    positions: Floats  # (T, 22, 3) metres, world, floor at 0
+    rotations: Floats  # (T, 22, 4) xyzw, local
+    contacts: NDArray[np.bool_]  # (T, 8) labels
 
     @property
     def hidden(self) -> NDArray[np.bool_]:

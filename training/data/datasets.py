@@ -83,16 +83,11 @@ Use = Literal["default", "research", "measure"]
 
 @dataclass(frozen=True)
 class DataSet:
-    name: str
-    """name of the source"""
-    files: str
-    """regular expression of the first word of the names of its files or folders"""
-    weights: Use
-    """weights that it may train"""
-    read: Callable[[Path, Progress], Iterator[Clip | Dropped]]
-    """reads a file or folder"""
-    split: Callable[[Clip], Split]
-    """assigns a clip to training, validation or test"""
+    name: str  # name of the source
+    files: str  # regular expression of the first word of the names of its files or folders
+    weights: Use  # weights that it may train
+    read: Callable[[Path, Progress], Iterator[Clip | Dropped]]  # reads a file or folder
+    split: Callable[[Clip], Split]  # assigns a clip to training, validation or test
 
     def matches(self, path: Path) -> bool:
         return re.match(rf"{self.files}\b", path.name) is not None

@@ -40,16 +40,11 @@ class Windows:
 
 
 class Batch(NamedTuple):
-    x: Tensor
-    """(B, 66, T) tracks minus the model's mean, in units of `SCALE`; interpolated where unobserved"""
-    observed: Tensor
-    """(B, 66, T) 1 where observed"""
-    certainty: Tensor
-    """(B, 66, T) of x: 1 where observed; elsewhere 0 until it is `completed`"""
-    target: Tensor
-    """(B, 66, T) ground truth in the same frame"""
-    counts: Tensor
-    """(B, 1, T) weight in the loss: 1 from the body's first observation on, 0 before it"""
+    x: Tensor  # (B, 66, T) tracks minus the model's mean, in units of `SCALE`; interpolated where unobserved
+    observed: Tensor  # (B, 66, T) 1 where observed
+    certainty: Tensor  # (B, 66, T) of x: 1 where observed; elsewhere 0 until it is `completed`
+    target: Tensor  # (B, 66, T) ground truth in the same frame
+    counts: Tensor  # (B, 1, T) weight in the loss: 1 from the body's first observation on, 0 before it
 
     @classmethod
     def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats) -> Batch:

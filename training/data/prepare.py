@@ -53,22 +53,14 @@ RAISED = 0.12
 class Prepared:
     """A recording ready for training."""
 
-    clip: Clip
-    """its joints canonical, at 30 Hz, z up, floor at z = 0"""
-    weights: Use
-    """which weights it may train"""
-    split: Split
-    """training, validation or test"""
-    offsets: NDArray[np.float64]
-    """(22, 3) metres, its subject's bones"""
-    rotations: NDArray[np.float64]
-    """(T, 22, 4) local, xyzw"""
-    contacts: NDArray[np.bool_]
-    """(T, 8) labels"""
-    flat: bool
-    """whether the person stays on the floor; contacts on raised objects are not labelled"""
-    speed: float = 1.0
-    """factor by which it is sped up"""
+    clip: Clip  # its joints canonical, at 30 Hz, z up, floor at z = 0
+    weights: Use  # which weights it may train
+    split: Split  # training, validation or test
+    offsets: NDArray[np.float64]  # (22, 3) metres, its subject's bones
+    rotations: NDArray[np.float64]  # (T, 22, 4) local, xyzw
+    contacts: NDArray[np.bool_]  # (T, 8) labels
+    flat: bool  # whether the person stays on the floor; contacts on raised objects are not labelled
+    speed: float = 1.0  # factor by which it is sped up
 
     def __post_init__(self) -> None:
         if (self.weights, self.split) == ("measure", "train"):

@@ -41,14 +41,10 @@ UNREADABLE = "cannot be read"
 class Dropped:
     """A recording, or a part of one, that is excluded from training, with the reason."""
 
-    name: str
-    """name of the recording"""
-    source: str
-    """its data set"""
-    kind: str
-    """general cause, for counting"""
-    cause: str
-    """the cause in this case, with its figures"""
+    name: str  # name of the recording
+    source: str  # its data set
+    kind: str  # general cause, for counting
+    cause: str  # the cause in this case, with its figures
 
 
 Progress = Callable[[float], None]

@@ -36,14 +36,10 @@ _ALIGNED = [
 class Motion:
     """Recordings in a row, at 30 Hz."""
 
-    positions: NDArray[np.float32]
-    """(N, 22, 3) float32 metres, z up"""
-    start: NDArray[np.int64]
-    """(C + 1,) first frame of each recording, and the end"""
-    source: NDArray[np.str_]
-    """(C,) name of the data set"""
-    speed: Floats
-    """(C,) factor by which the recording is sped up"""
+    positions: NDArray[np.float32]  # (N, 22, 3) float32 metres, z up
+    start: NDArray[np.int64]  # (C + 1,) first frame of each recording, and the end
+    source: NDArray[np.str_]  # (C,) name of the data set
+    speed: Floats  # (C,) factor by which the recording is sped up
 
 
 @dataclass(frozen=True)

@@ -65,14 +65,10 @@ class Gaussian(NamedTuple):
 
 
 class HGVAEOutput(NamedTuple):
-    tracks: Gaussian
-    """p(x | z), mean and log-variance (B, N, T), in units of `SCALE`"""
-    kl: Tensor
-    """(B, L) KL(q || p) of each level, top first; 0 if a level is off"""
-    log_prior: Tensor
-    """(B, L) log p(m | above) at the posterior's means m, the terms of the score of section 7"""
-    top: Tensor
-    """(B, latent) the top level's posterior mean"""
+    tracks: Gaussian  # p(x | z), mean and log-variance (B, N, T), in units of `SCALE`
+    kl: Tensor  # (B, L) KL(q || p) of each level, top first; 0 if a level is off
+    log_prior: Tensor  # (B, L) log p(m | above) at the posterior's means m, the terms of the score of section 7
+    top: Tensor  # (B, latent) the top level's posterior mean
 
 
 class HGVAE(nn.Module):

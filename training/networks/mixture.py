@@ -43,14 +43,10 @@ FIRST_GATE = -4.0
 
 @dataclass(frozen=True)
 class MixtureConfig:
-    own: int = 32
-    """number of features of each joint"""
-    body: int = 384
-    """number of features of the whole body"""
-    told: int = 24
-    """number of the body's features passed to each joint"""
-    head: int = 64
-    """width of the layers that compute a joint's output"""
+    own: int = 32  # number of features of each joint
+    body: int = 384  # number of features of the whole body
+    told: int = 24  # number of the body's features passed to each joint
+    head: int = 64  # width of the layers that compute a joint's output
 
 
 class Memory(nn.Module):

@@ -148,12 +148,9 @@ def train_completer(options: TrainingOptions, config: CompleterConfig | None = N
 class Truth:
     """Windows of true motion."""
 
-    rotations: Tensor
-    """(B, T, 22, 3, 3) local"""
-    root: Tensor
-    """(B, T, 3) metres, world"""
-    offsets: Tensor
-    """(B, 22, 3) metres, bones"""
+    rotations: Tensor  # (B, T, 22, 3, 3) local
+    root: Tensor  # (B, T, 3) metres, world
+    offsets: Tensor  # (B, 22, 3) metres, bones
 
     @classmethod
     def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:

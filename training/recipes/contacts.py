@@ -41,8 +41,7 @@ OUTPUTS = 2 * len(CONTACT_JOINTS)
 
 @dataclass(frozen=True)
 class ContactConfig:
-    hidden: int = 64
-    """numbers that the network remembers of a body"""
+    hidden: int = 64  # numbers that the network remembers of a body
 
 
 class ContactNet(nn.Module):
@@ -98,16 +97,11 @@ _FEET = slice(2, 6)
 class Pool:
     """Smoothed clips, (C, T, ...)."""
 
-    positions: NDArray[np.float32]
-    """(C, T, 22, 3) metres, world, float32"""
-    sigma: NDArray[np.float32]
-    """(C, T, 22) metres"""
-    yaw: NDArray[np.float32]
-    """(C, T) radians"""
-    load: NDArray[np.bool_]
-    """(C, T, 8) labels"""
-    rest: NDArray[np.bool_]
-    """(C, T, 8)"""
+    positions: NDArray[np.float32]  # (C, T, 22, 3) metres, world, float32
+    sigma: NDArray[np.float32]  # (C, T, 22) metres
+    yaw: NDArray[np.float32]  # (C, T) radians
+    load: NDArray[np.bool_]  # (C, T, 8) labels
+    rest: NDArray[np.bool_]  # (C, T, 8)
 
 
 def smoothed_clips(motion: MotionSet, count: int, seed: int) -> Pool:

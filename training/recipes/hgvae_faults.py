@@ -161,10 +161,8 @@ def _reconstruct(
 class Scored(NamedTuple):
     """Scores of windows, from `score_windows`."""
 
-    odds: Floats
-    """(B, 22) log odds from `joint_odds`"""
-    pace: Floats
-    """(B,) m/s, from `pace`"""
+    odds: Floats  # (B, 22) log odds from `joint_odds`
+    pace: Floats  # (B,) m/s, from `pace`
 
 
 @torch.inference_mode()

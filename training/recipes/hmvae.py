@@ -56,18 +56,12 @@ kernel, twice the dimensions of z_l (for fast motion), and encoding about the me
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    iterations: int
-    """number of optimiser steps"""
-    batch: int
-    """windows per step"""
-    learning_rate: float
-    """initial learning rate of Adam; it falls to a third twice"""
-    joint_weight: float
-    """lambda of equation 5"""
-    strides: Sequence[int]
-    """frame strides of windows; each entry has the same probability"""
-    speed_weighted: bool
-    """whether windows are speed-weighted: fast motion is drawn more often, large sources less"""
+    iterations: int  # number of optimiser steps
+    batch: int  # windows per step
+    learning_rate: float  # initial learning rate of Adam; it falls to a third twice
+    joint_weight: float  # lambda of equation 5
+    strides: Sequence[int]  # frame strides of windows; each entry has the same probability
+    speed_weighted: bool  # whether windows are speed-weighted: fast motion is drawn more often, large sources less
 
 
 # The paper varies the frame rate. Prepared motion has 30 Hz, so its halves and thirds are available. Half of the

@@ -62,16 +62,11 @@ fewer degrees of freedom than coordinates; and largest number of expectation-max
 class Sequences:
     """Sequences of states, drawn from motion."""
 
-    motion: MotionSet
-    """N frames of prepared motion"""
-    load: Tensor
-    """(N, 8) whether `CONTACT_JOINTS` bear load"""
-    rest: Tensor
-    """(N, 8) whether they rest"""
-    starts: np.ndarray
-    """(M,) frames at which a sequence may start"""
-    chances: np.ndarray
-    """(M,) probabilities of these starts"""
+    motion: MotionSet  # N frames of prepared motion
+    load: Tensor  # (N, 8) whether `CONTACT_JOINTS` bear load
+    rest: Tensor  # (N, 8) whether they rest
+    starts: np.ndarray  # (M,) frames at which a sequence may start
+    chances: np.ndarray  # (M,) probabilities of these starts
 
     @classmethod
     def of(cls, motion: MotionSet) -> Sequences:
@@ -113,12 +108,9 @@ class Sequences:
 class Batch:
     """B sequences of T steps."""
 
-    states: State
-    """(B, T + 1)"""
-    offsets: Tensor
-    """(B, 22, 3) metres"""
-    contacts: Tensor
-    """(B, T, 16) labels of load, then of rest, after each step"""
+    states: State  # (B, T + 1)
+    offsets: Tensor  # (B, 22, 3) metres
+    contacts: Tensor  # (B, T, 16) labels of load, then of rest, after each step
 
 
 def train_humor(options: TrainingOptions) -> Path:

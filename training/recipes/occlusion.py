@@ -79,8 +79,7 @@ _OCCLUSIONS: tuple[tuple[float, list[int]], ...] = (
 
 @dataclass(frozen=True)
 class OcclusionConfig:
-    hidden: int = 96
-    """of each layer"""
+    hidden: int = 96  # of each layer
 
 
 class OcclusionNet(nn.Module):
@@ -115,14 +114,10 @@ class OcclusionNet(nn.Module):
 class Rows:
     """N occluded joints."""
 
-    features: NDArray[np.float32]
-    """(N, `FEATURES`) features"""
-    joint: NDArray[np.int64]
-    """(N,) index of the joint"""
-    candidates: NDArray[np.float32]
-    """(N, 4, 3) metres relative to the first candidate"""
-    truth: NDArray[np.float32]
-    """(N, 3) metres, likewise"""
+    features: NDArray[np.float32]  # (N, `FEATURES`) features
+    joint: NDArray[np.int64]  # (N,) index of the joint
+    candidates: NDArray[np.float32]  # (N, 4, 3) metres relative to the first candidate
+    truth: NDArray[np.float32]  # (N, 3) metres, likewise
 
 
 def occlusions(truth: Floats, rng: Rng) -> Bools:

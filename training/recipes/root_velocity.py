@@ -29,12 +29,9 @@ from steadypose.training.loop import Recipe, Rng, TrainingOptions
 class RootMotion(NamedTuple):
     """The network's predictions for each frame, in the frame of the body's heading."""
 
-    velocity: Tensor
-    """(B, T, 3) m/s, velocity of the root."""
-    log_sigma: Tensor
-    """(B, T, 3) logarithm of the velocity's standard deviation along each axis, in m/s."""
-    contact_logits: Tensor
-    """(B, T, 8) logits of contact of `CONTACT_JOINTS`."""
+    velocity: Tensor  # (B, T, 3) m/s, velocity of the root
+    log_sigma: Tensor  # (B, T, 3) logarithm of the velocity's standard deviation along each axis, in m/s
+    contact_logits: Tensor  # (B, T, 8) logits of contact of `CONTACT_JOINTS`
 
 
 class TrajectoryNet(nn.Module):
@@ -104,24 +101,17 @@ _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]
 class _Motion:
     """True motion in B windows of T frames. Positions have one more frame at each end, for central differences."""
 
-    positions: Tensor
-    """(B, T + 2, 22, 3) metres, world"""
-    yaw: Tensor
-    """(B, T) radians, heading of the body"""
-    contacts: Tensor
-    """(B, T, 8) labels"""
+    positions: Tensor  # (B, T + 2, 22, 3) metres, world
+    yaw: Tensor  # (B, T) radians, heading of the body
+    contacts: Tensor  # (B, T, 8) labels
 
 
 @dataclass(frozen=True)
 class _Windows:
-    features: Tensor
-    """(B, T, FEATURES) input"""
-    turn: Tensor
-    """(B, T, 3, 3) rotations from a frame's heading to the world"""
-    velocity: Tensor
-    """(B, T, 3) m/s, velocity of the root, world"""
-    contacts: Tensor
-    """(B, T, 8) labels"""
+    features: Tensor  # (B, T, FEATURES) input
+    turn: Tensor  # (B, T, 3, 3) rotations from a frame's heading to the world
+    velocity: Tensor  # (B, T, 3) m/s, velocity of the root, world
+    contacts: Tensor  # (B, T, 8) labels
 
 
 def train_trajectory(options: TrainingOptions) -> Path:

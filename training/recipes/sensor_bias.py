@@ -85,26 +85,19 @@ INPUT_NOISE = 0.03
 class SensorTake:
     """A person recorded by a sensor and by a reference at the same times, at 30 Hz."""
 
-    person: str
-    """name of the person"""
-    observed: Floats
-    """(T, 22, 3) metres, z up, from the sensor; NaN where unobserved"""
-    camera: Floats
-    """(3,) metres, position of the sensor in that frame"""
-    truth: Floats
-    """(T, 22, 3) metres, from the reference, in any frame; NaN where unknown"""
+    person: str  # name of the person
+    observed: Floats  # (T, 22, 3) metres, z up, from the sensor; NaN where unobserved
+    camera: Floats  # (3,) metres, position of the sensor in that frame
+    truth: Floats  # (T, 22, 3) metres, from the reference, in any frame; NaN where unknown
 
 
 @dataclass(frozen=True)
 class HeldOut:
     """Mean distance of one person's joints from the reference over joints and frames, metres."""
 
-    person: str
-    """name of the person; the correction was learned from all others"""
-    observed_m: float
-    """error of the sensor's joints after the best rigid alignment of each take"""
-    corrected_m: float
-    """the same with correction"""
+    person: str  # name of the person; the correction was learned from all others
+    observed_m: float  # error of the sensor's joints after the best rigid alignment of each take
+    corrected_m: float  # the same with correction
 
 
 def train_correction(options: TrainingOptions, subjects: Collection[str] = TRAIN_SUBJECTS) -> Path:
