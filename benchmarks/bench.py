@@ -67,10 +67,8 @@ TUNED_ON = 3
 """Step between the clips on which baselines are tuned. They are among the clips that are scored, with other noise,
 which favours the baselines."""
 
-DELAYS = (0, 2, 4, 8)
-"""Delays at which methods are compared, frames at 30 Hz."""
-SEEDS = (0, 1, 2)
-"""Seeds of networks trained here, and of random sampling."""
+DELAYS = (0, 2, 4, 8)  # delays at which methods are compared, frames at 30 Hz
+SEEDS = (0, 1, 2)  # seeds of networks trained here, and of random sampling
 RECURRENT = "GRU of the whole body"
 
 
@@ -237,8 +235,7 @@ def _averaged(group: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 ROUNDS = 50
-SIZE = 44
-"""Number of states of a whole body along one axis: positions and velocities of 22 joints."""
+SIZE = 44  # number of states of a whole body along one axis: positions and velocities of 22 joints
 STEPS = 30
 
 

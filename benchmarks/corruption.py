@@ -112,8 +112,7 @@ Fault = Callable[[Floats, np.random.Generator], tuple[Floats, NDArray[np.bool_]]
 """Maps clean windows (B, T, 22, 3) to corrupted ones, and returns which of them (B,) contain the fault."""
 
 HELD = "a joint frozen"
-BEGINS = 20
-"""Frame in which a fault begins; it lasts to the window's end."""
+BEGINS = 20  # frame in which a fault begins; it lasts to the window's end
 MIN_MOTION = 0.10
 """Least motion of a frozen joint, metres; with less, it is indistinguishable from a still one."""
 

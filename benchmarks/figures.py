@@ -31,8 +31,7 @@ COLOURS = {
 """Colour of each method in every plot; other methods take matplotlib's next."""
 
 
-_CENTIMETRES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-"""Ticks of deviations, cm."""
+_CENTIMETRES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # ticks of deviations, cm
 
 
 def curves(

@@ -25,16 +25,11 @@ from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
 
-FRAMES = 120
-"""Number of frames of each bundled stream that are processed."""
-PROJECTIONS = 8
-"""Number of projections kept of each output."""
-HIDDEN = 50, 70
-"""First frame in which an arm is hidden, and first in which it is seen again."""
-LEGLESS = "wave_hidden_arm"
-"""Stream whose legs are never seen."""
-NOISE_M = 0.01
-"""Standard deviation of the noise along an axis, metres."""
+FRAMES = 120  # number of frames of each bundled stream that are processed
+PROJECTIONS = 8  # number of projections kept of each output
+HIDDEN = 50, 70  # first frame in which an arm is hidden, and first in which it is seen again
+LEGLESS = "wave_hidden_arm"  # stream whose legs are never seen
+NOISE_M = 0.01  # standard deviation of the noise along an axis, metres
 
 _ARM = [J["left_elbow"], J["left_wrist"]]
 _LEGS = np.ravel(limbs(("hip", "knee", "ankle", "foot")))

@@ -26,32 +26,21 @@ from steadypose import PACKAGE
 from steadypose.prior.models.weights import WEIGHTS
 
 ROOT = Path(__file__).resolve().parent.parent
-RESULTS = Path(__file__).parent / "results"
-"""Folder of the results from which the README's tables are written."""
+RESULTS = Path(__file__).parent / "results"  # folder of the results from which the README's tables are written
 
 _WEIGHTS = ("mixture weights", "occlusion weights", "hgvae weights", "posture weights")
 _HMVAE, _TRAJECTORY = ("hmvae weights",), ("contacts weights", "trajectory weights")
 
-CLEAN = ("pose/clean", *_WEIGHTS)
-"""What `pose/clean` with default settings depends on, including the names in `ships`."""
-CLEAN_22 = ("pose/clean of 22 joints", *_WEIGHTS)
-"""The same, if all canonical joints are given."""
+CLEAN = ("pose/clean", *_WEIGHTS)  # what `pose/clean` with default settings depends on, including the names in `ships`
+CLEAN_22 = ("pose/clean of 22 joints", *_WEIGHTS)  # the same, if all canonical joints are given
 
 VARIANTS = (*CLEAN, "pose/clean, HM-VAE", *_HMVAE)
 """What all variants of `benchmarks.product` depend on. One of them refines with HM-VAE, which the default does not."""
-VARIANTS_22 = (*CLEAN_22, "pose/clean of 22 joints, HM-VAE", *_HMVAE)
-"""The same, if all canonical joints are given."""
-
-WORLD = (*CLEAN, "pose/world", *_TRAJECTORY)
-"""What `pose/world` depends on."""
-WORLD_22 = (*CLEAN_22, "pose/world of 22 joints", *_TRAJECTORY)
-"""The same, if all canonical joints are given."""
-
-COMPLETE = "complete"
-"""Output of `steadypose complete` on streams with a gap."""
-
-_WEIGHT_SETS = ("default", "kinect_v2")
-"""Weight sets that ship; others may be installed beside them."""
+VARIANTS_22 = (*CLEAN_22, "pose/clean of 22 joints, HM-VAE", *_HMVAE)  # the same, if all canonical joints are given
+WORLD = (*CLEAN, "pose/world", *_TRAJECTORY)  # what `pose/world` depends on
+WORLD_22 = (*CLEAN_22, "pose/world of 22 joints", *_TRAJECTORY)  # the same, if all canonical joints are given
+COMPLETE = "complete"  # output of `steadypose complete` on streams with a gap
+_WEIGHT_SETS = ("default", "kinect_v2")  # weight sets that ship; others may be installed beside them
 
 _PLUMBING = tuple(f"benchmarks.{name}" for name in ("evaluate", "figures", "output", "provenance", "report", "results"))
 """Modules that change no figure."""

@@ -162,8 +162,7 @@ PRODUCT = ("steadypose", "steadypose: pose/world")
 NO_BASELINE = ("truth", "HM-VAE", "steadypose", "ridge regression", "temporal convolution")
 """How names begin that are no baselines: the truth, our own variants, and what was trained on the very sensor."""
 
-LEAST_MM = 0.05
-"""Errors below it count as it, because a ratio of two of them says nothing, millimetres."""
+LEAST_MM = 0.05  # errors below it count as it, because a ratio of two of them says nothing, millimetres
 
 _OVERVIEW = """
 ## Overview

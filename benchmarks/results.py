@@ -20,14 +20,12 @@ from steadypose.benchmarks.provenance import RESULTS, ROOT, code, machine, measu
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PICTURES = ROOT / "docs" / "images"
-"""Folder of the studies' pictures, which docs/results.md shows."""
+PICTURES = ROOT / "docs" / "images"  # folder of the studies' pictures, which docs/results.md shows
 READINGS = RESULTS / "test-readings.csv"
 """Log of every scoring of the test split. A split that is read often is being used for choices: if you change something
 after a reading, write the change into the last column."""
 
-NONE = "–"
-"""Text of a table's cell where a method has no estimate."""
+NONE = "–"  # text of a table's cell where a method has no estimate
 
 
 @dataclass(frozen=True)

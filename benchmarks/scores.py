@@ -176,8 +176,7 @@ def _mean(values: Floats) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-_LEAST = 1e-6
-"""Lower bound of the errors in a ratio, metres."""
+_LEAST = 1e-6  # lower bound of the errors in a ratio, metres
 
 
 def source_table(

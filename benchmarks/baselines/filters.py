@@ -20,8 +20,7 @@ from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
-OFFLINE = -1
-"""Delay of a method that needs the whole recording."""
+OFFLINE = -1  # delay of a method that needs the whole recording
 
 _HAMPEL_HALF = 5  # frames to either side, as far as they are available
 _HAMPEL_FLOOR = 0.005  # metres: without it, a still body has no spread and every observation would be an outlier

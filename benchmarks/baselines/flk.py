@@ -28,8 +28,7 @@ SPACE = {"alpha": (1e-3, 10.0), "theta": (0.05, 0.99), "kept": (0.5, 1.0)}
 LEAST_FRAMES, MOST_SPREAD = 20, 0.02
 """A bone's length counts as known after more than this many frames, if its standard deviation is below this; metres."""
 
-SAME_LENGTH = 0.01
-"""Deviation of a bone's length that is not corrected, as a fraction."""
+SAME_LENGTH = 0.01  # deviation of a bone's length that is not corrected, as a fraction
 
 _LIMBS = [J[f"{side}_{part}"] for part in ("elbow", "wrist", "knee", "ankle", "foot") for side in ("left", "right")]
 _PARENTS = [PARENTS[joint] for joint in _LIMBS]

@@ -41,8 +41,7 @@ from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.tracks import body_covariance
 from steadypose.prior.timing.rate import FPS
 
-_UNKNOWN = (1e3, 1.0, 5.0)
-"""Standard deviations of a joint never observed: metres, m/s, m/s²."""
+_UNKNOWN = (1e3, 1.0, 5.0)  # standard deviations of a joint never observed: metres, m/s, m/s²
 
 
 class Smoothed(NamedTuple):
@@ -235,16 +234,13 @@ def _measure(mean, covariance, joint, measured):  # pragma: no cover
             covariance[k, j] -= gain * row[j]
 
 
-JOINT_DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)
-"""Process densities of the joints' smoothers, m²/s³."""
+JOINT_DENSITIES = (0.05, 0.3, 1.8, 10.0, 60.0)  # process densities of the joints' smoothers, m²/s³
 
 _RECENT, _NOISE_FRAMES = 9, 30
 _MIN_NOISE, _FIRST_NOISE = 1e-4, 0.01
 """Lower bound of the estimated noise, and its value before the fourth observation, metres."""
-_MEDIAN_NORM = 1.538
-"""Median length of a normal vector in space with a standard deviation of 1 along each axis."""
-_THIRD = np.sqrt(20.0)
-"""Standard deviation of the third difference of white noise of standard deviation 1."""
+_MEDIAN_NORM = 1.538  # median length of a normal vector in space with a standard deviation of 1 along each axis
+_THIRD = np.sqrt(20.0)  # standard deviation of the third difference of white noise of standard deviation 1
 
 
 def bank(seen: Floats, stamps_s: Floats, delay: int) -> Floats:

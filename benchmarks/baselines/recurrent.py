@@ -20,10 +20,8 @@ from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import MIRROR, J
 
-WIDTH, BATCH, FRAMES = 256, 32, 60
-"""Units of the network; clips per step, and their length."""
-SCALE = 5.0
-"""Units per metre in the network."""
+WIDTH, BATCH, FRAMES = 256, 32, 60  # units of the network; clips per step, and their length
+SCALE = 5.0  # units per metre in the network
 _JOINTS = len(MIRROR)
 
 

@@ -21,14 +21,12 @@ from steadypose.benchmarks.corruption import LIMBS, correlated, gaussian, hide, 
 from steadypose.benchmarks.motion import MotionClips
 from steadypose.prior.arrays import Floats
 
-WINDOW = 32
-"""Length of a window, frames."""
+WINDOW = 32  # length of a window, frames
 _WIDTH, _BLOCKS = 128, 3
 _SCALE = 10.0  # units per metre in the network
 _BATCH = 16  # windows of whole bodies
 
-Track = Callable[[Iterable[int]], Iterable[int]]
-"""Type of what shows the progress of a loop."""
+Track = Callable[[Iterable[int]], Iterable[int]]  # type of what shows the progress of a loop
 
 
 class SmoothNet(nn.Module):

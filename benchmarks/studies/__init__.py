@@ -20,5 +20,4 @@ SENSORS = {
 NO_SPLIT = ("kinect_vicon", "heading", "mediapipe", "contacts", "counter")
 """Studies of people that have no test split, so that reading them is not logged."""
 
-PREPARED = ("event_mocap",)
-"""Studies that need prepared motion and cannot use simulated people instead."""
+PREPARED = ("event_mocap",)  # studies that need prepared motion and cannot use simulated people instead

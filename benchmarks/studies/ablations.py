@@ -113,8 +113,7 @@ FLAGGING = (
 )
 """Parts that flags may depend on."""
 
-SOUND = ("1 cm", "lasting 2 cm")
-"""Conditions without a fault."""
+SOUND = ("1 cm", "lasting 2 cm")  # conditions without a fault
 
 FAULTY = (
     "arms exchanged",

@@ -40,8 +40,7 @@ from steadypose.training.networks.hgvae import HGVAE
 DEPENDS_ON = (COMPLETE, "completer weights", "hgvae weights", "hmvae64 weights", "prior.fit.optimise")
 
 FRAMES = 50
-SEARCHED = 8
-"""Number of windows on which HM-VAE is searched, five seconds for each and each hidden part."""
+SEARCHED = 8  # number of windows on which HM-VAE is searched, five seconds for each and each hidden part
 
 
 def _named(*parts: str) -> list[int]:

@@ -27,12 +27,9 @@ from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = WORLD_22
 
-LOADED_N = 30.0
-"""Force above which a foot bears load, newtons."""
-PHASES = 3
-"""Number of 30 Hz streams from one recording."""
-NOISES = (0.0, 0.02, 0.04)
-"""Standard deviations of the noise, metres."""
+LOADED_N = 30.0  # force above which a foot bears load, newtons
+PHASES = 3  # number of 30 Hz streams from one recording
+NOISES = (0.0, 0.02, 0.04)  # standard deviations of the noise, metres
 DELAY = 4
 KINDS: Mapping[str, Callable[[str], bool]] = {
     "walking": lambda trial: trial.startswith("walking"),

@@ -35,8 +35,7 @@ from steadypose.benchmarks.scores import (
 )
 from steadypose.prior.arrays import Floats
 
-Condition = Callable[[Floats, np.random.Generator], Floats]
-"""Maps true joints (T, C, 22, 3) to observed ones."""
+Condition = Callable[[Floats, np.random.Generator], Floats]  # maps true joints (T, C, 22, 3) to observed ones
 
 HOW = (
     "Baselines are tuned on every third of these clips with other noise, each with the same number of evaluations, for "

@@ -45,14 +45,12 @@ COUNTERS = {
     "hips and below hidden": [J["pelvis"], *HIPS, *_LEGS],
 }
 """Canonical joints behind each counter."""
-SETTLED_S = 1.0
-"""Time at the start of a stream that is not scored, seconds."""
+SETTLED_S = 1.0  # time at the start of a stream that is not scored, seconds
 UP, TRUNK = 0.7, float(REST_POSITIONS[SHOULDERS[0], 2])
 """The baseline's least height of a standing body's hips, and its height of the shoulders above the hips, metres."""
 STANDS, SITS = 1, -1
 
-Body = Mapping[str, Floats]
-"""A body over time (T, ...), in the world: stamps and heights, metres, seconds, radians."""
+Body = Mapping[str, Floats]  # A body over time (T, ...), in the world: stamps and heights, metres, seconds, radians
 
 
 def truth_at(motion: Motion, scene: str, stamps_s: Floats) -> Body:

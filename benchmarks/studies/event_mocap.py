@@ -41,15 +41,12 @@ SEED, ALL, CLIPS = 7, "all", 2
 
 LONGEST, SHORTEST = round(15.0 * FPS), round(1.5 * FPS)
 """Longest and shortest clips, frames. Longer takes are cut, because people walk out of the camera's view."""
-NEAREST, FARTHEST = 2.8, 4.0
-"""Distance from the camera to the middle of a scene, metres."""
-AT_END_S = 0.5
-"""Time before the end of a clip within which detecting a beginning is optional, seconds."""
+NEAREST, FARTHEST = 2.8, 4.0  # distance from the camera to the middle of a scene, metres
+AT_END_S = 0.5  # time before the end of a clip within which detecting a beginning is optional, seconds
 UP, FALL_S = 0.7, 2.0
 """Fraction of the hips' greatest height above which a person is up, and the time before lying within which a falling
 person was up, seconds."""
-ALWAYS_OPEN = {EventKind.ENTERED, EventKind.LEFT, EventKind.NEAR, EventKind.POINTS}
-"""Kinds that no name decides."""
+ALWAYS_OPEN = {EventKind.ENTERED, EventKind.LEFT, EventKind.NEAR, EventKind.POINTS}  # kinds that no name decides
 ACTIONS = {
     "Bandai-Namco": (),
     "UI-PRMD (Vicon)": (),
@@ -62,8 +59,7 @@ SQUATS = ("m01", "m02", "m03", "m04")
 WAVERS = ("wave", "bye")
 QUIET = ("walk", "run", "dash", "raise")
 """Of Bandai-Namco's actions, those that wave and those that surely do not."""
-WAVE = 0.41
-"""Swing out and back of a forearm that counts as a wave in these joints, radians."""
+WAVE = 0.41  # swing out and back of a forearm that counts as a wave in these joints, radians
 FALLERS = ("fallAndGetUp", "pushAndFall")
 
 

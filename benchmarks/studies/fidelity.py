@@ -37,12 +37,10 @@ from steadypose.prior.timing.rate import FPS
 DEPENDS_ON = CLEAN_22
 
 DELAYS = (0, 2, 4, 8, 16)
-SPEEDS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
-"""Edges of the speed bins, m/s."""
+SPEEDS = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)  # edges of the speed bins, m/s
 CLIPS, FRAMES = 24, 90
 NOISES_M = (0.0, 0.002, 0.01, 0.02, 0.04)
-CAMERA = (3.0, 0.0, 1.2)
-"""Camera position relative to the point below the pelvis in the middle of a clip, metres."""
+CAMERA = (3.0, 0.0, 1.2)  # camera position relative to the point below the pelvis in the middle of a clip, metres
 
 
 def conditions(quick: bool) -> dict[str, Callable[[Floats, np.random.Generator], Floats]]:
@@ -141,8 +139,7 @@ def _tables(records: list[dict[str, Any]], bench: Bench, clips: MotionClips) -> 
 
 
 UNTUNED = ("raw", "bank of smoothers", "whole-body bank", "steadypose")
-SUMMARISED = (0, 4)
-"""Delays in the README's table, frames; the table of all has the others."""
+SUMMARISED = (0, 4)  # delays in the README's table, frames; the table of all has the others
 
 
 def _summary_table(records: Sequence[Mapping[str, Any]], note: str) -> Table:

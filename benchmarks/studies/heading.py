@@ -33,8 +33,7 @@ from steadypose.training.data.readers import VALIDATION_SUBJECTS, load_pairs
 
 DEPENDS_ON = VARIANTS
 
-_PARTS = {"pelvis": (HIPS,), "trunk": (HIPS, SHOULDERS)}
-"""Parts whose heading the Kinect's is compared with."""
+_PARTS = {"pelvis": (HIPS,), "trunk": (HIPS, SHOULDERS)}  # parts whose heading the Kinect's is compared with
 _STREAMS = ROOT / "sim_data"
 
 

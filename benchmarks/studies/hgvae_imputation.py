@@ -34,15 +34,11 @@ from steadypose.training.weights import arrays_of
 
 Mask = NDArray[np.bool_]
 
-FEATURES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)
-"""Shares of all 3,300 entries that are hidden."""
+FEATURES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.5)  # shares of all 3,300 entries that are hidden
 BURSTS_S = (0.1, 0.3, 0.5, 1.0)
 
-PAPER_RATE = 0.01
-"""Adam's learning rate for the entries, metres: the best on windows of training."""
-
-BIAS_SIGMA = 0.0
-"""Bias of the sensor, metres; the windows are clean."""
+PAPER_RATE = 0.01  # Adam's learning rate for the entries, metres: the best on windows of training
+BIAS_SIGMA = 0.0  # bias of the sensor, metres; the windows are clean
 
 
 def some_features(shape: tuple[int, int], rng: np.random.Generator, share: float) -> Mask:

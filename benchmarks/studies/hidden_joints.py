@@ -42,13 +42,10 @@ DEPENDS_ON = VARIANTS_22
 BESIDE = "held beside the body"
 GAUSSIAN = "conditional Gaussian"
 FILTER = "Kalman, whole body"
-KNOW_THE_BODY = (BESIDE, GAUSSIAN, FILTER)
-"""Baselines that use the whole body, unlike a filter for each joint."""
+KNOW_THE_BODY = (BESIDE, GAUSSIAN, FILTER)  # baselines that use the whole body, unlike a filter for each joint
 
-NOISE = 0.01
-"""Standard deviation of the noise, metres."""
-SEEN_FIRST = 15
-"""Number of frames at the start in which everything is observed."""
+NOISE = 0.01  # standard deviation of the noise, metres
+SEEN_FIRST = 15  # number of frames at the start in which everything is observed
 BURSTS_S = (0.2, 0.5, 1.0, 2.0)
 
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]

@@ -95,11 +95,8 @@ def _trained(config: HumorConfig, train: MotionSet, val: MotionSet, runs: Path, 
     return load_network(HumorNet, HumorConfig.from_dict, str(path), "humor")
 
 
-SAMPLES, LONG_S = 50, 5.0
-"""Number of samples, and length of long futures in seconds, as in the paper."""
-
-SPARED = 4
-"""Factor by which fewer samples are drawn of the long futures, because pairs are many."""
+SAMPLES, LONG_S = 50, 5.0  # number of samples, and length of long futures in seconds, as in the paper
+SPARED = 4  # factor by which fewer samples are drawn of the long futures, because pairs are many
 
 LOWEST_M, HIGHEST_M = 0.1, 1.6
 """Lowest and highest pelvis, metres. A future that ever leaves this range has diverged; the truth never does."""
@@ -173,8 +170,7 @@ def _mm(value: Tensor) -> float:
 DEPENDS_ON = (*CLEAN_22, "humor weights", "prior.fit", "training.recipes.humor")
 
 FRAMES = 90
-DELAY = 8
-"""Delay of the live output from which fits start, frames."""
+DELAY = 8  # delay of the live output from which fits start, frames
 CLIPS, PICTURES, FUTURES = 4, 8, 12
 """Number of clips of Table 2, of Tables 3 and 4, and of Table 1, taken evenly from all sources of the split."""
 

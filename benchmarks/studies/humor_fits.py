@@ -29,22 +29,18 @@ from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.fit.windows import Track, load_of
 from steadypose.prior.timing.rate import FPS
 
-NOISE, HIDDEN_BELOW = 0.04, 0.9
-"""HuMoR's noise of joints, and the height below which joints are hidden, metres."""
+NOISE, HIDDEN_BELOW = 0.04, 0.9  # HuMoR's noise of joints, and the height below which joints are hidden, metres
 
 LEGS = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
 TOES = [J["left_foot"], J["right_foot"]]
-DEPTHS = np.arange(0.0, 0.151, 0.03)
-"""HuMoR's thresholds of penetration, metres."""
+DEPTHS = np.arange(0.0, 0.151, 0.03)  # HuMoR's thresholds of penetration, metres
 
 FOCAL, CENTRE = 900.0, (640.0, 360.0)
-CAMERA_HEIGHT, AWAY = 1.3, 4.5
-"""Height of a level camera, and its mean distance from a clip, metres."""
+CAMERA_HEIGHT, AWAY = 1.3, 4.5  # height of a level camera, and its mean distance from a clip, metres
 PIXELS, MISSED, WRONG, WRONG_PIXELS = 5.0, 0.1, 0.02, 60.0
 """A detector's errors: noise in pixels, share of missed key points, share of wrong ones, and their error in pixels."""
 
-POINTS = 200
-"""Number of surface points per frame."""
+POINTS = 200  # number of surface points per frame
 
 
 @dataclass(frozen=True)
@@ -129,8 +125,7 @@ def pictures(clips: MotionClips, clip: int, rng: np.random.Generator) -> Picture
     return Pictures(truth, np.asarray(np.isfinite(pixels).all(axis=-1)), flat, deep)
 
 
-CAMERA = replace(PICTURES, ground_height_sigma=0.05)
-"""Settings of ``steadypose fit`` for a camera of known height."""
+CAMERA = replace(PICTURES, ground_height_sigma=0.05)  # settings of ``steadypose fit`` for a camera of known height
 
 
 def scores(answers: Sequence[Answer], truth: Floats, hidden: NDArray[np.bool_], contacts: NDArray[np.bool_],

@@ -43,8 +43,7 @@ DEPENDS_ON = (COMPLETE, "completer weights", "hmvae64 weights", "prior.fit.optim
 
 GAPS = (5, 15, 30, 45)
 BEFORE, AFTER = 10, 1
-SEARCHED = 8
-"""Number of clips on which HM-VAE is searched, which takes seconds for each."""
+SEARCHED = 8  # number of clips on which HM-VAE is searched, which takes seconds for each
 FRAMES = BEFORE + max(GAPS) + AFTER
 
 JOINTS_GIVEN = "cubic spline, joints given"

@@ -74,10 +74,8 @@ def read_clips(path: Path, subjects: Sequence[str], every: int) -> list[Clip]:
     return clips
 
 
-OFF = 0.10
-"""Error that the predicted standard deviation should indicate, metres."""
-WORST = 0.1
-"""Share of frames, the worst by mean error, that the anomaly should indicate."""
+OFF = 0.10  # error that the predicted standard deviation should indicate, metres
+WORST = 0.1  # share of frames, the worst by mean error, that the anomaly should indicate
 
 
 class Scores(NamedTuple):

@@ -29,11 +29,9 @@ from steadypose.prior.clean.settings import PriorSettings
 DEPENDS_ON = CLEAN
 
 LAYOUTS = ("smpl22", "kinect22", "blazepose33", "coco17")
-NOISE = 0.02
-"""Standard deviation of the noise along an axis, metres."""
+NOISE = 0.02  # standard deviation of the noise along an axis, metres
 DELAY = PriorSettings().delay
-SETTLED = 30
-"""Number of frames at the start that are not scored."""
+SETTLED = 30  # number of frames at the start that are not scored
 
 _LOWER = [J["pelvis"], *np.ravel(limbs(("hip", "knee", "ankle", "foot")))]
 GROUPS = {

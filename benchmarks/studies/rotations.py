@@ -50,8 +50,7 @@ DEPENDS_ON = (*VARIANTS_22, "humor weights", "prior.fit")
 
 DELAY, FIT_DELAY = PriorSettings().delay, 8
 """Delays of the live output that is scored, and of that from which fits start, frames."""
-LASTING = math.exp(-1.0 / (0.5 * FPS))
-"""Correlation between frames of noise that lasts for half a second (to 1 / e)."""
+LASTING = math.exp(-1.0 / (0.5 * FPS))  # correlation between frames of noise that lasts for half a second (to 1 / e)
 CAMERA_M, DEPTH = 4.0, 4.0
 """Distance of a camera from the middle of a clip, metres; its errors along the line of sight over those across it."""
 PERFECT, AIMED, STEADYPOSE, FIT = "none", "aimed bones", "steadypose", "`steadypose fit`, offline"

@@ -147,8 +147,7 @@ def _at_rate(orientations: Floats, fps: float, frames: int) -> Floats:
 _BALLS = [SCORED.index(J[name]) for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")]
 STRAIGHT, BENT = np.radians((10.0, 30.0))
 """Bend of knee or elbow below which a limb is straight, and above which it is bent, radians."""
-SLOW, FAST = 0.5, 1.5
-"""Speeds of the joint at the bone's end below which it is slow, and above which it is fast, m/s."""
+SLOW, FAST = 0.5, 1.5  # speeds of the joint at the bone's end below which it is slow, and above which it is fast, m/s
 _ROUNDS, _NEAR = 8, np.radians(2.0)
 
 

@@ -40,17 +40,12 @@ from steadypose.prior.world.settings import TrajectorySettings
 
 DEPENDS_ON = (*VARIANTS_22, *WORLD_22)
 
-NOISE = 0.02
-"""Standard deviation of the noise, metres, with a correlation of 0.9 between frames."""
+NOISE = 0.02  # standard deviation of the noise, metres, with a correlation of 0.9 between frames
 DELAY = 4
-SKATING = 0.10
-"""Speed above which a foot in contact skates, m/s."""
-UNDER = 0.02
-"""Depth under the floor beyond which a sole penetrates it, metres."""
-SPEEDS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, np.inf)
-"""Edges of the bins of the root's speed, m/s."""
-FRAMES = 192
-"""Length of a clip, frames: two times 36 observed and 60 hidden."""
+SKATING = 0.10  # speed above which a foot in contact skates, m/s
+UNDER = 0.02  # depth under the floor beyond which a sole penetrates it, metres
+SPEEDS = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, np.inf)  # edges of the bins of the root's speed, m/s
+FRAMES = 192  # length of a clip, frames: two times 36 observed and 60 hidden
 
 
 def run(bench: Bench) -> Result:
@@ -184,17 +179,13 @@ def measure(clips: MotionClips, answer: Floats) -> dict[str, Any]:
     return result
 
 
-SEEN_FRAMES, HIDDEN_FRAMES = 36, 60
-"""Number of frames in which the root is observed, then hidden, in turn."""
+SEEN_FRAMES, HIDDEN_FRAMES = 36, 60  # number of frames in which the root is observed, then hidden, in turn
 
 ROOT_NOISE, JOINT_NOISE = 0.015, 0.01
 """Standard deviations of the root's error, and of the joints' errors relative to it, metres."""
 
-MEMORY = 0.95
-"""Correlation of these errors between frames."""
-
-HORIZONS = (15, 30, 60)
-"""Frames after which the hidden root is compared with the truth."""
+MEMORY = 0.95  # correlation of these errors between frames
+HORIZONS = (15, 30, 60)  # frames after which the hidden root is compared with the truth
 
 
 class Way(NamedTuple):

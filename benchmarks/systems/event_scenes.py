@@ -29,10 +29,8 @@ from steadypose.prior.sim.motion import SIGN, ArmAction, Intent, Motion, perform
 from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.training.data.prepare import runs
 
-DOUBT = 0.05
-"""Margin beyond a threshold within which detection is optional, metres or radians."""
-SHORTEST_S = 0.25
-"""Shortest duration that must be detected, seconds; shorter events are optional."""
+DOUBT = 0.05  # margin beyond a threshold within which detection is optional, metres or radians
+SHORTEST_S = 0.25  # shortest duration that must be detected, seconds; shorter events are optional
 GRAVITY = 9.81
 LEG = [J[f"left_{joint}"] for joint in ("hip", "knee", "ankle", "foot")]
 
@@ -260,10 +258,8 @@ def in_view(labels: Sequence[Label], person: int, t: Floats, seen: NDArray[np.bo
                 yield label._replace(start_s=start_s, end_s=end_s)
 
 
-MOMENTS = (EventKind.ENTERED, EventKind.LEFT)
-"""Kinds without a duration."""
-EARLY_S, LATE_S = 0.5, 1.0
-"""How long before and after its true onset a detection matches a label, seconds."""
+MOMENTS = (EventKind.ENTERED, EventKind.LEFT)  # kinds without a duration
+EARLY_S, LATE_S = 0.5, 1.0  # how long before and after its true onset a detection matches a label, seconds
 
 
 @dataclass

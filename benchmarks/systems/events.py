@@ -35,8 +35,7 @@ DELAYS = (
     "Delays are between stamps of capture, from the onset in the true motion: the prior's own delay, which holds up "
     "every pose, comes on top."
 )
-IN_VIEW = 0.5
-"""Least share of a body's joints in the camera's view for the body to count as present."""
+IN_VIEW = 0.5  # least share of a body's joints in the camera's view for the body to count as present
 
 
 def worlds_of(raw: Iterable[PoseRaw]) -> Iterator[PoseClean | PoseWorld]:

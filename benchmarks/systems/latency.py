@@ -44,8 +44,7 @@ LATENCIES = {"p50": "{latency_ms[p50]:.1f}", "p95": "{latency_ms[p95]:.1f}", "p9
 """Columns of a table of latencies."""
 LATEST_MS = 150.0
 """Largest 99th percentile of the latency of a pose of the newest frame, milliseconds, whatever the load."""
-SPACING = 0.8
-"""Distance between the copies of a body, metres."""
+SPACING = 0.8  # distance between the copies of a body, metres
 WARM_UP, WARM_UP_S = 60, 5.0
 """Frames, and seconds of live nodes, before times count. The first ones load code and fill the window."""
 

@@ -32,8 +32,7 @@ from steadypose.nodes.graph.topology import POSE_NODES
 DEPENDS_ON = WORLD
 
 RECORDING = ROOT / "sim_data" / "walk_turn"
-KILLS = 20
-"""Number of times that each node is killed, and that all nodes are started."""
+KILLS = 20  # number of times that each node is killed, and that all nodes are started
 PAUSE_S = STEADY_S / len(POSE_NODES) + 1.0
 """Time between kills of different nodes, seconds. Each node runs for longer than `STEADY_S`, so none is restarted with
 a pause."""
@@ -42,8 +41,7 @@ AT_ONCE_S = 0.5
 recording."""
 ALL = "all, started"
 FIRST = "all, started for the first time"
-FIRST_S = 600.0
-"""Time allowed for compiling the loops, seconds."""
+FIRST_S = 600.0  # time allowed for compiling the loops, seconds
 BUSY = ", processors busy"
 
 

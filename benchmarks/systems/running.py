@@ -20,10 +20,8 @@ from steadypose.nodes.graph.node import WATCHER
 from steadypose.nodes.graph.supervisor import Supervisor
 from steadypose.nodes.graph.topology import POSE_NODES
 
-START_S = 60.0
-"""Time allowed for the nodes to start, seconds."""
-SILENCE_S = 30.0
-"""Time without a message after which a node counts as hung, seconds."""
+START_S = 60.0  # time allowed for the nodes to start, seconds
+SILENCE_S = 30.0  # time without a message after which a node counts as hung, seconds
 
 
 class Running(NamedTuple):

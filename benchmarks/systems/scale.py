@@ -46,10 +46,8 @@ DEPENDS_ON = WORLD
 
 CLIENTS = (1, 4, 8, 16)
 LIVE_CLIENTS = (1, 4, 8, 16, 32)
-NETWORK_NS = 3_000_000
-"""Network latency of a message, nanoseconds."""
-LAST_S = 1.0
-"""Time after the messages that count in which they may be answered, seconds."""
+NETWORK_NS = 3_000_000  # network latency of a message, nanoseconds
+LAST_S = 1.0  # time after the messages that count in which they may be answered, seconds
 PERIOD_MS = FRAME_NS / 1e6
 
 

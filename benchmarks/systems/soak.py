@@ -47,16 +47,11 @@ from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = WORLD
 
-MINUTES = 60.0
-"""Duration of both halves together, minutes; the last replay is completed."""
-FRAMES = 1200
-"""Length of a replay, frames: 40 s."""
-BETWEEN_S = 6.0
-"""Time between faults, seconds."""
-BACK_S = 30.0
-"""Longest time without poses after a fault, seconds."""
-HUNG_S = 14.0
-"""Duration of a hang, seconds; longer than a supervisor waits."""
+MINUTES = 60.0  # duration of both halves together, minutes; the last replay is completed
+FRAMES = 1200  # length of a replay, frames: 40 s
+BETWEEN_S = 6.0  # time between faults, seconds
+BACK_S = 30.0  # longest time without poses after a fault, seconds
+HUNG_S = 14.0  # duration of a hang, seconds; longer than a supervisor waits
 UNSAID = 40
 """Largest number of messages that a node processes between two reports. A killed node never reports those since its
 last."""
@@ -64,8 +59,7 @@ DISK = "size=24m"
 POSES = (POSE_RAW, POSE_CLEAN, POSE_WORLD)
 CAUSES = {"in": "in.", "lost": "dropped.lost", "expired": "dropped.expired", "away": "dropped.away"}
 """What becomes of a message, and its name in diagnostics."""
-SAME_M = 1e-6
-"""Largest difference of equal positions, metres; positions are float32."""
+SAME_M = 1e-6  # largest difference of equal positions, metres; positions are float32
 CLOCK_STEPS_S = (3600.0, -1800.0, 60.0, -60.0)
 GARBAGE = (
     b"GET / HTTP/1.1\r\n\r\n",

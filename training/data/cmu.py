@@ -52,8 +52,7 @@ CMU_AMC = Rig(
     up="y",
 )
 
-INCH = 0.0254
-"""Length of an inch, metres: an ASF gives lengths in inches times its ``length`` unit."""
+INCH = 0.0254  # length of an inch, metres: an ASF gives lengths in inches times its ``length`` unit
 
 
 def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np.float64]]]:
@@ -99,8 +98,7 @@ class Asf:
     """the size of the file's unit"""
 
 
-_Bone = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]
-"""Offset, axis and freedoms, as in `Asf`."""
+_Bone = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]  # offset, axis and freedoms, as in `Asf`
 
 
 @documented

@@ -21,8 +21,7 @@ Fault = Callable[[Floats, slice, list[int], Floats, Rng], None]
 """Type of a tracking fault: changes some joints in a slice of the frames of a window (T, 22, 3), in place. The other
 window (T, 22, 3) is of another person, for faults that mix two bodies."""
 
-SLOW_HZ = 0.7
-"""Largest frequency of a sensor's bias, Hz."""
+SLOW_HZ = 0.7  # largest frequency of a sensor's bias, Hz
 
 _LIMBS = limbs(
     ("wrist",), ("elbow", "wrist"), ("shoulder", "elbow", "wrist"),
@@ -72,8 +71,7 @@ def vary_builds(positions: Floats, length_sigma: float, turn_sigma: float, rng: 
     return other
 
 
-JITTER_SHARE = 0.5
-"""Share of jitter in the variance of a sensor's error; the rest is bias."""
+JITTER_SHARE = 0.5  # share of jitter in the variance of a sensor's error; the rest is bias
 
 
 def with_sensor_error(positions: Floats, sigma: Floats | float, rng: Rng) -> Floats:

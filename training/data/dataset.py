@@ -21,8 +21,7 @@ from steadypose.prior.mocap.clip import MotionError, person_of
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import WeightSet
 
-MIN_SPEED = 0.25
-"""Speed added to the joints' speed in the sampling weight of a window, m/s."""
+MIN_SPEED = 0.25  # speed added to the joints' speed in the sampling weight of a window, m/s
 
 _ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "contacts", "subject", "source"}
 

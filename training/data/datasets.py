@@ -34,8 +34,7 @@ CMU_LICENCE = "CMU mocap: free, no resale"
 """Licence of CMU's data: free for all uses including products; the data may not be resold; acknowledge NSF
 EIA-0196217."""
 
-CMU_FPS = 120.0
-"""Frame rate of CMU's AMC files, which do not contain it, frames per second."""
+CMU_FPS = 120.0  # frame rate of CMU's AMC files, which do not contain it, frames per second
 
 CMU_ACTIONS = {
     "01": "playground", "06": "basketball", "07": "walk", "02_01": "walk", "02_02": "walk", "02_03": "run",
@@ -69,8 +68,7 @@ NORMALISED = "first2s"
 Takes that are also in `cmu_more` itself match it at 0.5 to 0.6 of their speed, jumps at 1.3 to 2. No file states the
 factor, and motion at a wrong speed would teach wrong speeds."""
 
-Split = Literal["train", "val", "test"]
-"""Split of a recording; nothing may be chosen on ``test``."""
+Split = Literal["train", "val", "test"]  # split of a recording; nothing may be chosen on ``test``
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 

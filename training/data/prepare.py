@@ -25,8 +25,7 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.datasets import Split, Use
 from steadypose.training.data.readers import Dropped
 
-CUTOFF = 12.0
-"""Cut-off frequency of the anti-aliasing filter before resampling to 30 Hz, Hz."""
+CUTOFF = 12.0  # cut-off frequency of the anti-aliasing filter before resampling to 30 Hz, Hz
 
 FAST_ENOUGH = 50.0
 """Least frame rate of a recording that may be played faster, frames per second; a slower one lacks motion at 30 Hz."""
@@ -34,8 +33,7 @@ FAST_ENOUGH = 50.0
 MAX_GAP = 0.2
 """Longest gap of a joint that is interpolated, seconds; at longer gaps, the recording is cut."""
 
-MIN_SECONDS = 1.0
-"""Least duration of a recording, seconds; shorter ones are dropped, as in HuMoR."""
+MIN_SECONDS = 1.0  # least duration of a recording, seconds; shorter ones are dropped, as in HuMoR
 
 MAX_BONE_CHANGE = 0.10
 """Largest difference of a bone from its median in the recording, metres. Bones computed from skin markers vary by 1 to
@@ -45,8 +43,7 @@ MAX_ACCELERATION = 200.0
 """Largest acceleration (second difference at 30 Hz), m/s². The fastest real motion of these recordings, a kicking foot,
 reaches 195; a joint that jumps by 15 cm and back reaches 270."""
 
-RAISED = 0.12
-"""Height above the floor above which a lower toe that stands still is on something else, metres."""
+RAISED = 0.12  # height above the floor above which a lower toe that stands still is on something else, metres
 
 
 @dataclass(frozen=True)

@@ -18,19 +18,15 @@ from steadypose.training.data.recordings import Motion, Pairs, load_kinect, load
 
 Rng = np.random.Generator
 
-GATED = 0.18
-"""Size of jumps above which 90 % are removed, as by the gate before the mixture, metres."""
+GATED = 0.18  # size of jumps above which 90 % are removed, as by the gate before the mixture, metres
 
 KINDS = ("perfect", "white", "coloured", "replayed", "mixed", "kinect", "monocular")
 SHARES = np.array([0.13, 0.25, 0.15, 0.11, 0.11, 0.13, 0.12])
 """Shares of the kinds of sensors: no error, white noise, AR(1) noise, a real Kinect's errors added to other motion, all
 of these together, the real Kinect's recordings, and a monocular network with errors in each bone's depth."""
 
-TURNED = 0.25
-"""Share of clips in which the whole body is turned, so that people lie, stand on their hands or roll."""
-
-CARRIED = 0.15
-"""Share of clips from a moving camera with unknown pose, such as a robot's or one that is bumped into."""
+TURNED = 0.25  # share of clips in which the whole body is turned, so that people lie, stand on their hands or roll
+CARRIED = 0.15  # share of clips from a moving camera with unknown pose, such as a robot's or one that is bumped into
 
 _SWINGS = (
     ("elbow", "wrist"),

@@ -23,8 +23,7 @@ from steadypose.prior.models.hgvae.live_completion import (
 )
 from steadypose.prior.models.weights import weights_path
 
-DROPOUT = 0.05
-"""Share of the outputs of the completion network's layers that training drops."""
+DROPOUT = 0.05  # share of the outputs of the completion network's layers that training drops
 
 
 class GraphLinear(nn.Module):

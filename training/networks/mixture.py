@@ -37,8 +37,7 @@ from steadypose.prior.timing.rate import FPS
 
 JOINTS = 22
 
-FIRST_GATE = -4.0
-"""Initial bias of the gates, which gives almost no weight to the previous output."""
+FIRST_GATE = -4.0  # initial bias of the gates, which gives almost no weight to the previous output
 
 
 @dataclass(frozen=True)

@@ -91,8 +91,7 @@ ITERATIONS, BATCH, LEARNING_RATE = 4_000, 36_000, 1.2e-3
 GAPS, CONTEXT = (3, 64), (2, 30)
 """Ranges of the length of a gap, and of the known context before and after it together, frames."""
 
-SCALES = (0.85, 1.15)
-"""Range of factors on people's sizes."""
+SCALES = (0.85, 1.15)  # range of factors on people's sizes
 
 TRAINED_SHARE = 20.0
 """`SHARE_FRAMES` in training. Inference takes a smaller share, because other people's motion is predicted less well."""
@@ -300,8 +299,7 @@ HIDDEN_PARTS = (_ARMS[1], _ARMS[3], _LEGS[0], _LEGS[2], [J["head"], J["neck"]], 
 """Parts that are hidden to measure the errors of their joints; the first part with a joint counts."""
 
 
-CALIBRATED = (15, 60)
-"""Lengths of the gaps in which parts are hidden to measure the errors of their joints, frames."""
+CALIBRATED = (15, 60)  # lengths of the gaps in which parts are hidden to measure the errors of their joints, frames
 
 
 @torch.no_grad()

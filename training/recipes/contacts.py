@@ -35,8 +35,7 @@ from steadypose.training.data.dataset import MotionSet, describe_data
 from steadypose.training.data.prepare import made_once
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
-OUTPUTS = 2 * len(CONTACT_JOINTS)
-"""Number of outputs: load of each joint, then rest of each joint."""
+OUTPUTS = 2 * len(CONTACT_JOINTS)  # number of outputs: load of each joint, then rest of each joint
 
 
 @dataclass(frozen=True)
@@ -59,32 +58,18 @@ class ContactNet(nn.Module):
         return load, rest
 
 
-ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3
-"""Number of steps; clips per step; initial learning rate."""
-
-FRAMES = 90
-"""Length of a clip, frames; it includes the start of a stream."""
-
-CLIPS = {"train": 3072, "val": 384}
-"""Number of smoothed clips of each split."""
-
-SIDE_BY_SIDE = 64
-"""Number of clips that are smoothed together as bodies of one stream."""
-
-DELAYS = (0, 2, 4, 4, 8)
-"""Delays of the smoother, frames."""
-
-MIN_SPEED = 0.1
-"""Least speed in the sampling weight of a clip, which is proportional to the speed of its feet, m/s."""
-
-SCALES = (0.8, 1.15)
-"""Range of factors on people's sizes."""
+ITERATIONS, BATCH, LEARNING_RATE = 3_000, 64, 4e-3  # number of steps; clips per step; initial learning rate
+FRAMES = 90  # length of a clip, frames; it includes the start of a stream
+CLIPS = {"train": 3072, "val": 384}  # number of smoothed clips of each split
+SIDE_BY_SIDE = 64  # number of clips that are smoothed together as bodies of one stream
+DELAYS = (0, 2, 4, 4, 8)  # delays of the smoother, frames
+MIN_SPEED = 0.1  # least speed in the sampling weight of a clip, which is proportional to the speed of its feet, m/s
+SCALES = (0.8, 1.15)  # range of factors on people's sizes
 
 SOLE_SD = 0.01
 """Standard deviation of offsets of joints, by rig and shoe, and of the ground from the training motion's, metres."""
 
-YAW_SD = math.radians(15.0)
-"""Standard deviation of the heading's error, radians."""
+YAW_SD = math.radians(15.0)  # standard deviation of the heading's error, radians
 
 ROOT_UNSEEN, GROUND_UNKNOWN, FEET_ALONE = 0.25, 0.25, 0.15
 """Shares of windows with joints relative to the root only, with unknown ground, and with only the feet known."""

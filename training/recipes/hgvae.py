@@ -39,8 +39,7 @@ from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
 from steadypose.training.recipes.hgvae_faults import train_anomaly
 from steadypose.training.weights import started
 
-ITERATIONS = 9_000
-"""Number of steps."""
+ITERATIONS = 9_000  # number of steps
 
 FAULTS = (stands_still, exchanged, displaced)
 FAULT_SHARE = 0.3
@@ -135,13 +134,9 @@ CONFIG = HGVAEConfig(
 )
 """Sizes with which it runs live on a robot's CPU; the paper's are about five times as wide."""
 
-BATCH, RATE = 64, 6e-3
-"""Windows per step, and initial learning rate."""
-
-KL_START = 0.001
-"""Initial beta (section 5)."""
-WARM_UP = 0.2
-"""Share of the training over which beta rises to 1 (paper: 200 of 5,000 epochs of a much longer training)."""
+BATCH, RATE = 64, 6e-3  # windows per step, and initial learning rate
+KL_START = 0.001  # initial beta (section 5)
+WARM_UP = 0.2  # share of the training over which beta rises to 1 (paper: 200 of 5,000 epochs of a much longer training)
 CLIP_ENTRY = 100.0
 """Maximum norm of the gradient (section 5) per square root of a window's entries, over which the loss is summed."""
 

@@ -64,8 +64,7 @@ WINDOWS = 2000
 FASTER, MAX_DRAWS = (1, 2, 3), 12
 """Strides of the windows from which each pace is selected, and largest number of draws, as fast windows are rare."""
 
-BATCH = 64
-"""Number of windows per step of the fault network."""
+BATCH = 64  # number of windows per step of the fault network
 
 MIN_FAULT = 0.015
 """Least error of a faulty joint along an axis over the scored frames, metres; it must also exceed the sensor's own
@@ -76,10 +75,8 @@ BONE_SIGMA, TURN_SIGMA = 0.05, 0.1
 """Standard deviations of the augmentation `vary_builds`: of the logarithm of bone lengths, and (at most) of rotations,
 radians. A person's build and posture are no faults."""
 
-FAULT_SHARE = 0.6
-"""Share of the windows that have a fault."""
-REPEATED = 0.15
-"""Share of the windows in which a tracker repeats its last output for some joints."""
+FAULT_SHARE = 0.6  # share of the windows that have a fault
+REPEATED = 0.15  # share of the windows in which a tracker repeats its last output for some joints
 
 
 def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:

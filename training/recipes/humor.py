@@ -18,17 +18,10 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.dataset import MotionSet, describe_data, mirror_offsets, mirror_rotations
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
-ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4
-"""Number of steps; sequences per step; initial learning rate."""
-
-STEPS = 10
-"""Number of steps of a training sequence."""
-
-SCALES = (0.9, 1.1)
-"""Range of factors on people's sizes."""
-
-MIN_SPEED = 0.1
-"""Speed added to the feet's speed in the sampling weight of a sequence, m/s."""
+ITERATIONS, BATCH, LEARNING_RATE = 6_000, 128, 7e-4  # number of steps; sequences per step; initial learning rate
+STEPS = 10  # number of steps of a training sequence
+SCALES = (0.9, 1.1)  # range of factors on people's sizes
+MIN_SPEED = 0.1  # speed added to the feet's speed in the sampling weight of a sequence, m/s
 
 KL_WEIGHT, KL_SHARE = 4e-4, 0.25
 """Weight of the KL divergence, as in the official code (summed over the latent; all other terms are means), and share

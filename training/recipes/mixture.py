@@ -28,14 +28,9 @@ from steadypose.training.data.sensors import Sensed, Sensors
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
 
-ITERATIONS, RATE = 6000, 2e-3
-"""Number of optimiser steps, and the initial learning rate."""
-
-FRAMES = 90
-"""Length of a clip, frames; it starts like a stream."""
-
-CLIPS, DELAYS_A_STEP = 16, 2
-"""Numbers of clips per delay, and of delays, in an optimiser step."""
+ITERATIONS, RATE = 6000, 2e-3  # number of optimiser steps, and the initial learning rate
+FRAMES = 90  # length of a clip, frames; it starts like a stream
+CLIPS, DELAYS_A_STEP = 16, 2  # numbers of clips per delay, and of delays, in an optimiser step
 
 DELAYS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16])
 DELAY_SHARES = np.array([0.22, 0.08, 0.12, 0.05, 0.17, 0.03, 0.04, 0.13, 0.03, 0.03, 0.10])
@@ -46,8 +41,7 @@ MIN_MM = 1.0
 SMOOTH_DELAYS, SMOOTH = (0, 1, 2, 4, 8), (0.25, 0.4, 0.8, 2.0, 3.0)
 """Weight of the acceleration error, by delay in frames; without delay, smoothness costs lag."""
 
-MIN_SMOOTH_MM = 0.5
-"""Error added to the best expert's acceleration error in the denominator, mm/frame²."""
+MIN_SMOOTH_MM = 0.5  # error added to the best expert's acceleration error in the denominator, mm/frame²
 
 SPEED_WEIGHT, MAX_SPEED_WEIGHT = 0.5, 60.0
 """Constants of the weight of a joint's position error: 1 + (speed / SPEED_WEIGHT m/s)², at most MAX_SPEED_WEIGHT.
@@ -58,11 +52,8 @@ LAG = 1.0
 """Weight of a clip's relative excess of position error over the most accurate expert. In time-correlated errors,
 smoothness must not come at the price of lag."""
 
-DEVIATION = 0.3
-"""Weight of the negative log-likelihood in the loss."""
-
-AVERAGE = 0.999
-"""Decay of the exponential moving average of the weights, which is saved."""
+DEVIATION = 0.3  # weight of the negative log-likelihood in the loss
+AVERAGE = 0.999  # decay of the exponential moving average of the weights, which is saved
 
 
 class Batch(NamedTuple):

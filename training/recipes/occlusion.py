@@ -34,27 +34,17 @@ from steadypose.training.data.recordings import write_arrays
 from steadypose.training.data.sensors import Sensors
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 
-FIRST_LOG_SIGMA = 4.0
-"""Initial logarithm of the standard deviation, which is in millimetres."""
+FIRST_LOG_SIGMA = 4.0  # initial logarithm of the standard deviation, which is in millimetres
 
 ITERATIONS, BATCH, LEARNING_RATE, WEIGHT_DECAY = 800, 4096, 3e-3, 0.1
 """Number of steps; occluded joints per step; initial learning rate of AdamW, which falls along a cosine; weight decay.
 More steps overfit the training people (benchmarks/NOTEBOOK.md, hidden joints)."""
 
-FRAMES, CLIPS = 120, 64
-"""Length of a clip, frames, and number of clips that are processed together as bodies of a run."""
-
-RECORDED = {"train": 16, "val": 4}
-"""Number of pipeline runs for each split."""
-
-ROWS = 60_000
-"""Largest number of occluded joints kept from a run."""
-
-RADII = 0.12, 0.2
-"""Range of radii of a trunk that hides arms, metres."""
-
-SEEN_FIRST = 8, 40
-"""Range of the time before joints are hidden, in clips that lose the lower part or one side, frames."""
+FRAMES, CLIPS = 120, 64  # length of a clip, frames, and number of clips that are processed together as bodies of a run
+RECORDED = {"train": 16, "val": 4}  # number of pipeline runs for each split
+ROWS = 60_000  # largest number of occluded joints kept from a run
+RADII = 0.12, 0.2  # range of radii of a trunk that hides arms, metres
+SEEN_FIRST = 8, 40  # range of the time before joints are hidden, in clips that lose the lower part or one side, frames
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 

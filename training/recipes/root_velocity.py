@@ -55,23 +55,12 @@ def _features(joints: Tensor, turn: Tensor) -> Tensor:
     return torch.cat([joints @ turn / FROM_ROOT, velocity], dim=-1).flatten(2)
 
 
-ITERATIONS, BATCH, LEARNING_RATE = 6_000, 64, 4e-3
-"""Number of steps; windows per step; initial learning rate."""
-
-WINDOW = 72
-"""Length of a training window, frames (2.4 s)."""
-
-WARM_UP = 12
-"""Number of first frames of a window without a loss, because they contain too little motion."""
-
-RATES = (0.6, 2.0)
-"""Range of factors on the speed of training motion."""
-
-SCALES = (0.8, 1.15)
-"""Range of factors on people's sizes in training."""
-
-MIN_SPEED = 0.15
-"""Least speed in the sampling weight of a window, which is proportional to the speed of its root, m/s."""
+ITERATIONS, BATCH, LEARNING_RATE = 6_000, 64, 4e-3  # number of steps; windows per step; initial learning rate
+WINDOW = 72  # length of a training window, frames (2.4 s)
+WARM_UP = 12  # number of first frames of a window without a loss, because they contain too little motion
+RATES = (0.6, 2.0)  # range of factors on the speed of training motion
+SCALES = (0.8, 1.15)  # range of factors on people's sizes in training
+MIN_SPEED = 0.15  # least speed in the sampling weight of a window, which is proportional to the speed of its root, m/s
 
 TILT_SD, YAW_SD, YAW_STEP_SD = np.deg2rad(3.0), np.deg2rad(6.0), np.deg2rad(1.0)
 """Standard deviations of the errors of gravity and of a window's heading, and of the heading error's change per frame,
@@ -84,14 +73,12 @@ OFFSET_SD = 0.015
 """Standard deviation of the offset between a sensor's and motion capture's definition of a joint in a window,
 metres."""
 
-IMPUTED_SHARE = 0.3
-"""Share of windows in which a limb is hidden for a while and held at its last position."""
+IMPUTED_SHARE = 0.3  # share of windows in which a limb is hidden for a while and held at its last position
 
 VELOCITY_WEIGHT, DRIFT_WEIGHT, NLL_WEIGHT, CONTACT_WEIGHT = 2.0, 0.5, 0.05, 0.1
 """Weights of the velocity's error, the path's error, the likelihood, and the contacts' cross-entropy."""
 
-SMALL = 0.3
-"""Velocity error up to which the loss is quadratic, and beyond which it is linear, m/s."""
+SMALL = 0.3  # velocity error up to which the loss is quadratic, and beyond which it is linear, m/s
 
 _LIMBS = limbs(("elbow", "wrist"), ("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))
 _MIRRORED_CONTACTS = [1, 0, 3, 2, 5, 4, 7, 6]

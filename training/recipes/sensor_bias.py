@@ -75,10 +75,8 @@ def mirror_features(x: Tensor) -> Tensor:
 
 ITERATIONS, BATCH, LEARNING_RATE, EVALUATIONS = 4_000, 256, 1e-3, 40
 """Numbers of steps and of frames per step; initial learning rate, which first doubles, then falls to 0; evaluations."""
-HIDE = 0.1
-"""Share of training frames with hidden joints, so that the network tolerates missing joints."""
-INPUT_NOISE = 0.03
-"""Noise on the inputs, standard deviations of a feature, as augmentation for only six people."""
+HIDE = 0.1  # share of training frames with hidden joints, so that the network tolerates missing joints
+INPUT_NOISE = 0.03  # noise on the inputs, standard deviations of a feature, as augmentation for only six people
 
 
 @dataclass(frozen=True)
