@@ -38,18 +38,12 @@ Loss = Callable[[int, float, np.random.Generator], tuple[Tensor, dict[str, float
 class TrainingOptions:
     """Options of ``steadypose train``, common to all models."""
 
-    data: Path
-    """``prepared.npz``, or other training data of the model"""
-    runs: Path
-    """folder of training runs; an interrupted run of the same name resumes there"""
-    weights: str = "default"
-    """the weight set, ``default`` or ``research``; for a sensor's correction, the sensor's name"""
-    iterations: int | None = None
-    """number of optimiser steps, at least 1; None for the model's default"""
-    seed: int = 0
-    """random seed of initial weights and of sampling"""
-    start: str | None = None
-    """weights to start from: a weight set or a path"""
+    data: Path  # ``prepared.npz``, or other training data of the model
+    runs: Path  # folder of training runs; an interrupted run of the same name resumes there
+    weights: str = "default"  # weight set, ``default`` or ``research``; for a sensor's correction, its name
+    iterations: int | None = None  # number of optimiser steps, at least 1; None for the model's default
+    seed: int = 0  # random seed of initial weights and of sampling
+    start: str | None = None  # weights to start from: a weight set or a path
 
     def __post_init__(self) -> None:
         if self.iterations is not None and self.iterations < 1:

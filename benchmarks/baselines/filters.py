@@ -33,16 +33,11 @@ _MEASUREMENT_SIGMA = 0.02  # metres, as in `fixed_lag`
 class Baseline:
     """A method and the range of its parameters."""
 
-    name: str
-    """name in tables"""
-    run: Callable[..., Floats]
-    """maps (seen, stamps_s, delay, **parameters) to estimates of seen's shape"""
-    delays: tuple[int, ...] | None = None
-    """supported delays; None for any"""
-    space: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """range of each parameter, searched evenly in its logarithm"""
-    whole_body: bool = False
-    """whether it needs all 22 canonical joints"""
+    name: str  # name in tables
+    run: Callable[..., Floats]  # maps (seen, stamps_s, delay, **parameters) to estimates of seen's shape
+    delays: tuple[int, ...] | None = None  # supported delays; None for any
+    space: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # range of each parameter; searched in logs
+    whole_body: bool = False  # whether it needs all 22 canonical joints
 
 
 def missing(seen: Floats) -> NDArray[np.bool_]:

@@ -43,10 +43,8 @@ class Label(NamedTuple):
     hand: Hand
     start_s: float
     end_s: float
-    required: bool = True
-    """Whether it must be detected. If not, as between a threshold and its margin, detection is optional."""
-    nearly_s: float = math.inf
-    """Earliest time at which it may be detected, if before its start."""
+    required: bool = True  # whether it must be detected; between a threshold and its margin, it need not
+    nearly_s: float = math.inf  # earliest time at which it may be detected, if before its start
 
 
 class Scene(NamedTuple):

@@ -166,18 +166,12 @@ class KinectPair:
     They agree in time but not in space: align them with one rotation and translation per clip.
     """
 
-    name: str
-    """name in the file, such as ``m01_s01_e01``; with ``_inc``, the movement is deliberately incorrect"""
-    subject: str
-    """``s01`` to ``s08``"""
-    movement: str
-    """``m01`` to ``m10``"""
-    fps: float
-    """frames per second"""
-    kinect: NDArray[np.float64]
-    """(T, 22, 3) metres, skeleton ``kinect22``. z up, the camera at the origin looking along +y"""
-    vicon: NDArray[np.float64]
-    """(T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost"""
+    name: str  # name in the file, such as ``m01_s01_e01``; with ``_inc``, the movement is deliberately incorrect
+    subject: str  # ``s01`` to ``s08``
+    movement: str  # ``m01`` to ``m10``
+    fps: float  # frames per second
+    kinect: NDArray[np.float64]  # (T, 22, 3) metres, ``kinect22``, z up, the camera at the origin, looking along +y
+    vicon: NDArray[np.float64]  # (T, 22, 3) metres, canonical joint centres, z up; NaN where markers were lost
 
 
 def _metres(counts: NDArray[np.int16]) -> NDArray[np.float64]:

@@ -46,14 +46,10 @@ class Motion:
 class Pairs:
     """Recordings of a real Kinect and its ground truth, concatenated, at 30 Hz."""
 
-    seen: NDArray[np.float32]
-    """(N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint"""
-    truth: NDArray[np.float32]
-    """(N, 22, 3) metres, from the Vicon, with the Kinect's joint definitions; NaN where unknown"""
-    start: NDArray[np.int64]
-    """(C + 1,) first frame of each recording, and the end"""
-    subject: NDArray[np.str_]
-    """(C,) the person"""
+    seen: NDArray[np.float32]  # (N, 22, 3) float32 metres, z up; NaN where the Kinect has no such joint
+    truth: NDArray[np.float32]  # (N, 22, 3) metres, Vicon's, with the Kinect's joint definitions; NaN where unknown
+    start: NDArray[np.int64]  # (C + 1,) first frame of each recording, and the end
+    subject: NDArray[np.str_]  # (C,) the person
 
     def of(self, subjects: Collection[str]) -> Pairs:
         clips = np.flatnonzero(np.isin(self.subject, list(subjects)))

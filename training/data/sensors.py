@@ -41,12 +41,9 @@ _LIMBS = limbs(_SWINGS[0], _SWINGS[2])
 class Sensed:
     """Clips as observed by simulated sensors."""
 
-    seen: Floats
-    """(C, T, 22, 3) metres, NaN where unobserved"""
-    truth: Floats
-    """(C, T, 22, 3) metres, NaN where unknown"""
-    confidence: Floats
-    """(C, T, 22) 0 to 1, the sensor's confidence; in 70 % of clips, the noise is inversely proportional to it"""
+    seen: Floats  # (C, T, 22, 3) metres, NaN where unobserved
+    truth: Floats  # (C, T, 22, 3) metres, NaN where unknown
+    confidence: Floats  # (C, T, 22) the sensor's, 0 to 1; in 70 % of clips, the noise is inversely proportional
 
 
 class Sensors:
