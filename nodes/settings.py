@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import Field, field, fields, is_dataclass
@@ -98,6 +99,11 @@ def load_plugin(setting: str, reference: Any) -> Any:
         raise LaunchError(
             f"{setting}: {reference} cannot be imported: {error}; install its package beside steadypose"
         ) from error
+
+
+def as_text(name: str) -> str:
+    """A file's name for messages and pictures: escapes stand for bytes that are not UTF-8, which these cannot hold."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def printable(text: str) -> str:

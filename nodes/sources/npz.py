@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import OBSERVED, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.layout import axes_hint, count_hint, skeleton_hint, stamps_hint
+from steadypose.nodes.settings import as_text
 from steadypose.prior.body.layouts import CANONICAL, SKELETONS
 from steadypose.prior.clean.admission import MAX_DISTANCE
 from steadypose.prior.npz import check_arrays
@@ -129,7 +130,7 @@ class ArraySource:
                 PoseRaw(
                     stamp_ns=int(stamp_ns),
                     frame_id="sensor",
-                    source=self.path.stem,
+                    source=as_text(self.path.stem),
                     skeleton=self._skeleton,
                     sensor_pose=self._sensor_pose,
                     calibrated=False,

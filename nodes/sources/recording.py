@@ -24,7 +24,7 @@ from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.stamps import RATES_HZ
 from steadypose.nodes.extras import require_extra
-from steadypose.nodes.settings import STREAMS, LaunchError, located
+from steadypose.nodes.settings import STREAMS, LaunchError, as_text, located
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
 from steadypose.prior.body.layouts import SKELETONS, Skeleton
@@ -200,7 +200,7 @@ class CsvSource:
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         for stamp_ns, bodies in self._frames:
             message = PoseRaw(
-                stamp_ns, "sensor", self.path.stem, self._skeleton.name, self._sensor_pose, False, list(bodies)
+                stamp_ns, "sensor", as_text(self.path.stem), self._skeleton.name, self._sensor_pose, False, list(bodies)
             )
             yield POSE_RAW, message
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.graph.clock import Clock
-from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.settings import LaunchError, as_text
 from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
@@ -286,7 +286,7 @@ class VideoSource:
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         video = cv2.VideoCapture(self._settings.video)
-        name = self.path.stem
+        name = as_text(self.path.stem)
         try:
             with (
                 self._make_landmarker(self._settings) as landmarker,

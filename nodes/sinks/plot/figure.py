@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN
 from steadypose.msgs.types import JOINTS, JointState
+from steadypose.nodes.settings import as_text
 from steadypose.nodes.sinks.drawing import ALL_BONES, STATE_COLOURS
 from steadypose.nodes.sinks.plot.history import History, PlotError, body_of, errors_of
 from steadypose.nodes.sinks.plot.panels import (
@@ -67,7 +68,7 @@ def draw(history: History, body: int | None = None) -> Figure:
     body_height = max(sum(heights), 9.0)
     figure = Figure(figsize=(16, STRIP + body_height), layout="constrained")
     figure.suptitle(
-        f"{history.name} · {history.origin} · body {chosen}, one of {len(bodies)}", fontsize=14, weight="bold"
+        f"{as_text(history.name)} · {history.origin} · body {chosen}, one of {len(bodies)}", fontsize=14, weight="bold"
     )
     rows = figure.add_gridspec(2, 1, height_ratios=[STRIP, body_height])
     draw_stick_figures(figure.add_subplot(rows[0]), history, chosen)
@@ -104,7 +105,9 @@ def draw_completion(completion: Completion, title: str) -> Figure:
     joints, known = completed.positions, completed.known
     there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
     figure = Figure(figsize=(15, 9), layout="constrained")
-    figure.suptitle(f"{title} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold")
+    figure.suptitle(
+        f"{as_text(title)} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold"
+    )
     grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
     sticks = figure.add_subplot(grid[0, :])
     chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from steadypose.msgs.types import JointState, Pose, PoseClean, PoseWorld
 from steadypose.nodes.commands.clean import clean
 from steadypose.nodes.commands.info import info
 from steadypose.nodes.commands.output import unfinished
-from steadypose.nodes.commands.small import repair
+from steadypose.nodes.commands.small import plot, repair
 from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.arrays import NpzCollector
@@ -70,6 +71,15 @@ def test_a_second_call_does_not_write_into_the_first_ones_folder(tmp_path: Path)
     with unfinished(out) as part:
         part.write_text("of the second")
     assert out.read_text() == "of the second"
+
+
+def test_a_name_that_is_not_utf_8_is_recorded_and_drawn(tmp_path: Path, capsys) -> None:
+    source = write_npz(tmp_path / os.fsdecode(b"f\xfcr.npz"), walked(FRAMES))
+    clean(source, tmp_path / "out")
+    info(str(tmp_path / "out"))
+    assert r"source f\xfcr;" in capsys.readouterr().out
+    plot(source, tmp_path / "out.png")
+    assert (tmp_path / "out.png").exists()
 
 
 def test_jittered_stamps_come_back_as_they_were(tmp_path: Path) -> None:
