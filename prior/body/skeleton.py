@@ -75,6 +75,9 @@ REST_OFFSETS: NDArray[np.float64] = np.array(
 It is a generic adult of 1.72 m with common anthropometric proportions.
 """
 
+REST_LENGTHS: NDArray[np.float64] = np.linalg.norm(REST_OFFSETS, axis=-1)
+"""(22,) length of each joint's bone, metres; 0 for the root."""
+
 
 def _rest_positions() -> NDArray[np.float64]:
     placed = np.zeros((len(PARENTS), 3))

@@ -14,7 +14,7 @@ from steadypose.msgs.types import CleanBody, PoseClean, PoseRaw, RawBody
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import SensorFrame, quaternions
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
-from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, finite_joints
+from steadypose.prior.body.skeleton import PARENT, REST_LENGTHS, finite_joints
 from steadypose.prior.clean.admission import MAX_DISTANCE, MAX_PLACE
 from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.compiled import median
@@ -24,8 +24,6 @@ MIN_SIZE, MAX_SIZE, MIN_BONES = 0.05, 2.5, 4
 it. Some trackers give every joint the same position, often zero, in frames in which they fail."""
 UNIT_TOLERANCE = 0.01
 """Largest deviation from 1 of the norm of a sensor's quaternion."""
-
-_REST_LENGTHS = np.linalg.norm(REST_OFFSETS[1:], axis=1)
 
 
 class BodyJoints(NamedTuple):
@@ -112,7 +110,7 @@ def _size_of(positions: Floats) -> float:
     """
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     observed = np.isfinite(lengths)
-    return median(lengths[observed] / _REST_LENGTHS[observed]) if observed.sum() >= MIN_BONES else 1.0
+    return median(lengths[observed] / REST_LENGTHS[1:][observed]) if observed.sum() >= MIN_BONES else 1.0
 
 
 def clean_bodies(frame: CleanFrame, sensor: SensorFrame, ids: Mapping[int, int]) -> dict[int, CleanBody]:

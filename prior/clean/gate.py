@@ -6,10 +6,9 @@ import math
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.skeleton import MIRROR, limbs
+from steadypose.prior.clean.exchanged import ExchangedLimbs, distances
 from steadypose.prior.clean.frame import Gated, Observation
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.clean.mirrored import MirroredLimbs
@@ -19,12 +18,6 @@ from steadypose.prior.compiled import median, njit
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
 
-# limbs whose sides detectors exchange: whole arms and whole legs
-_EXCHANGED = tuple(np.concatenate(limbs(chain)) for chain in (("elbow", "wrist"), ("knee", "ankle", "foot")))
-# shoulders and hips, which detectors may or may not exchange with the limb
-_BASES = tuple(np.concatenate(limbs((joint,))) for joint in ("shoulder", "hip"))
-_SWAP_APART = 0.15  # least mean distance of a limb's joints to their predictions to test for an exchange, metres
-_SWAP_BETTER = 0.4  # share to which an exchange must reduce that distance
 _JUMP_FACTOR = 7.0  # threshold in multiples of the jitter; one observation in a thousand exceeds it
 _JITTER_FRAMES = 15  # length of the running mean of the jitter, frames
 _UNIT_DISTANCE = 2.6  # median distance to the filter's prediction in white noise with sigma 1 along each axis
@@ -49,6 +42,7 @@ class Gate:
         self._counters = counters
         self._filter = ConstantVelocityFilter(acceleration_density=8.0, measurement_sigma=0.015)
         self._bones = BoneOutliers(slots)
+        self._exchanged = ExchangedLimbs(settings.patience, slots)
         self._mirrored = MirroredLimbs(slots)
         self._observed = Ring(RECENT + 1, (slots, 22, 3))
         self._jitter = np.zeros(slots)
@@ -56,7 +50,6 @@ class Gate:
         self._frames = np.zeros(slots, dtype=np.int64)
         self._lost = np.zeros((slots, 22))
         self._refused = np.zeros((slots, 22))
-        self._swapped = np.zeros((slots, len(_EXCHANGED)))
         self._bad_frames = np.zeros(slots)
 
     def forget(self, slot: Bools) -> None:
@@ -65,6 +58,7 @@ class Gate:
             self._filter.reset()  # a new stream: its stamps may be earlier
         self._filter.forget(np.repeat(slot[:, None], 22, axis=1))
         self._bones.forget(slot)
+        self._exchanged.forget(slot)
         self._mirrored.forget(slot)
         self._observed.clear(slot)
         self._jitter[slot] = 0.0
@@ -72,7 +66,6 @@ class Gate:
         self._frames[slot] = 0
         self._lost[slot] = 0
         self._refused[slot] = 0
-        self._swapped[slot] = 0
         self._bad_frames[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
@@ -87,9 +80,13 @@ class Gate:
         if s.enabled and frozen.any():
             self._counters["joints_stuck"] += int(frozen.sum())
             positions[frozen] = np.nan
+        if s.enabled:
+            self._restart(self._exchanged.begin(positions))
         expected = self._filter.predict(observation.stamp_s)
         if expected is not None:
-            distance = _apart(positions, expected.positions)
+            distance = distances(positions, expected.positions)
+            if s.enabled and self._put_back(positions, expected, distance):
+                distance = distances(positions, expected.positions)
             jitter = self._jitter.copy()
             self._measure_jitter(distance)
             if s.enabled:
@@ -99,19 +96,26 @@ class Gate:
         self._filter.update(positions, observation.stamp_s)
         return Gated(observation, positions, self._jitter.copy(), frozen | mirrored)
 
+    def _put_back(self, positions: Floats, expected: Smoothed, distance: Floats) -> bool:
+        """Put exchanged limbs back, in place; return whether a distance to a prediction has changed."""
+        exchanged, given_up = self._exchanged.update(positions, expected.positions, distance)
+        if not (exchanged or given_up.any()):
+            return False
+        self._counters["limbs_exchanged"] += exchanged
+        self._restart(given_up)
+        expected.positions[given_up] = np.nan
+        return True
+
     def _reject(self, positions: Floats, expected: Smoothed, distance: Floats, camera: Floats) -> Bools:
-        """Swap and mirror limbs back and set rejected joints to NaN, in place; return the joints that were mirrored."""
+        """Mirror limbs back and set rejected joints to NaN, in place; return the joints that were mirrored."""
         s = self._settings
         known = np.isfinite(expected.positions[..., 0])
-        if (distance > _SWAP_APART).any() or self._swapped.any():
-            self._exchange(positions, expected.positions, known)
-            distance = _apart(positions, expected.positions)
         mirrored, given_up = self._mirrored.update(positions, expected.positions, camera)
         if mirrored.any() or given_up.any():
             self._counters["joints_mirrored"] += int(mirrored.sum())
             self._restart(given_up)
             expected.positions[given_up] = np.nan
-            distance = _apart(positions, expected.positions)
+            distance = distances(positions, expected.positions)
         seen = np.isfinite(positions[..., 0])
         # a fast limb is far from its prediction in every frame, a joint that jumps only once
         least = np.maximum(np.maximum(s.jump, _JUMP_FACTOR * self._jitter)[:, None], _MEAN_FACTOR * self._mean_distance)
@@ -156,55 +160,6 @@ class Gate:
     def _restart(self, joints: Bools) -> None:
         if joints.any():
             self._filter.forget(joints)
-
-    def _exchange(self, positions: Floats, expected: Floats, known: Bools) -> None:
-        """Swap back limbs whose two sides are each nearer to the other side's prediction."""
-        for k, pair in enumerate(_EXCHANGED):
-            keep, swap = _kept_and_exchanged(positions, expected, pair)
-            with np.errstate(invalid="ignore"):  # a limb with a joint unseen compares as False
-                exchanged = (keep > _SWAP_APART) & (swap < _SWAP_BETTER * keep) & known[:, pair].all(axis=1)
-            # most frames are right, so one exchanged frame does not confirm another at the beginning
-            self._swapped[:, k] = np.maximum(self._swapped[:, k] + np.where(exchanged, 1, -1), 0)
-            overruled = self._swapped[:, k] > self._settings.patience * FPS
-            if overruled.any():
-                exchanged &= ~overruled
-                self._swapped[overruled, k] = 0
-                forget = np.zeros(known.shape, dtype=bool)
-                forget[np.ix_(overruled, pair)] = True
-                self._restart(forget)
-                expected[forget] = np.nan
-            if exchanged.any():
-                self._counters["limbs_exchanged"] += int(exchanged.sum())
-                _put_back(positions, exchanged, pair)
-                keep, swap = _kept_and_exchanged(positions, expected, _BASES[k])
-                _put_back(positions, exchanged & (swap < keep), _BASES[k])
-
-
-def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """(S,) metres, mean distance of the joints ``pair`` to their predictions: as observed, and with sides exchanged."""
-    return (
-        _apart(positions[:, pair], expected[:, pair]).mean(axis=1),
-        _apart(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1),
-    )
-
-
-def _put_back(positions: Floats, exchanged: Bools, pair: NDArray[np.intp]) -> None:
-    """Exchange the joints ``pair`` of both sides of the bodies ``exchanged`` (S,), in place."""
-    rows = np.flatnonzero(exchanged)[:, None]
-    positions[rows, pair] = positions[rows, MIRROR[pair]]
-
-
-@njit(cache=True)
-def _apart(a, b):
-    """(S, J) metres between joints (S, J, 3)."""
-    apart = np.empty(a.shape[:2])
-    for row in range(len(a)):
-        for joint in range(a.shape[1]):
-            square = 0.0
-            for axis in range(3):
-                square += (a[row, joint, axis] - b[row, joint, axis]) ** 2
-            apart[row, joint] = math.sqrt(square)
-    return apart
 
 
 @njit(cache=True)

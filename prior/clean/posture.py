@@ -35,6 +35,9 @@ LITTLE = 0.003
 AT_MOST = 1.5
 """Largest standard deviation of an observed joint in white noise, relative to the noise."""
 
+UNKNOWN_VARIANCE = 1e6
+"""Largest variance of a joint along an axis that a mean's counts, m²."""
+
 
 class Posture:
     """Moves joints towards their expectation given the whole body. It keeps no state."""
@@ -77,7 +80,8 @@ def mix(estimate: Estimate, unseen_s: Floats) -> Estimate:
     lacking = np.isinf(unseen_s) & np.isfinite(estimate.positions[:, :1, 0])
     if not (mixed := mixtures.mixed(lacking)).any():
         return estimate
-    of_parts = np.square(estimate.sigma) @ np.square(mixtures.SHARES).T
+    variance = np.minimum(np.square(estimate.sigma), UNKNOWN_VARIANCE)  # 0 times infinity would be NaN
+    of_parts = variance @ np.square(mixtures.SHARES).T
     return replace(
         estimate,
         positions=mixtures.mix(estimate.positions, lacking),

@@ -27,7 +27,7 @@ import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
-from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, SHOULDERS, J
+from steadypose.prior.body.skeleton import HIPS, MIRROR, PARENT, REST_LENGTHS, SHOULDERS, J
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, load_weights
 
@@ -52,7 +52,7 @@ DEPENDENT = 1.7
 """Factor on the covariance of the averaged root, because the two estimates share most noise (validation people)."""
 
 _CORNERS = (*HIPS, *SHOULDERS)
-_REST_SIZE = float(np.linalg.norm(REST_OFFSETS, axis=-1).sum())
+_REST_SIZE = float(REST_LENGTHS.sum())
 
 _CARRIED = (*HIPS, J["spine1"])
 _LEAST = 1e-6
@@ -109,6 +109,23 @@ class LivePosture:
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
         variance = np.diagonal(left, axis1=1, axis2=2).reshape(-1, 22, 3).mean(axis=-1)
         return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], np.sqrt(variance), root, turned)
+
+    def misfit(self, positions: Floats, sigma: float) -> Floats:
+        """(N,) half the squared Mahalanobis distance of one body's joints in N orders (N, 22, 3), metres, NaN where
+        unobserved, with errors of ``sigma`` metres along an axis. Only joints that are observed on both sides count.
+
+        The difference of two is the logarithm of the ratio of their likelihoods.
+        """
+        known = np.isfinite(positions[0, :, 0]) & np.isfinite(positions[0, MIRROR, 0])
+        bones = np.linalg.norm(positions[0] - positions[0, PARENT], axis=-1)
+        seen = known & (REST_LENGTHS > 0.0)
+        size = float(np.median(bones[seen] / REST_LENGTHS[seen])) if seen.any() else 1.0
+        middle = positions[:, list(_CORNERS)].mean(axis=1)
+        local = (positions - middle[:, None]) @ trunk_frame(positions) / size
+        off = local[:, known].reshape(len(local), -1) - self._mean.reshape(22, 3)[known].ravel()
+        rows = np.repeat(known, 3)
+        covariance = self.covariance[np.ix_(rows, rows)] + sigma**2 * np.eye(int(rows.sum()))
+        return 0.5 * (off.T * np.linalg.solve(covariance, off.T)).sum(axis=0)
 
     def sigma_given(self, known: Bools) -> Floats:
         """(22,) metres along an axis, standard deviations of joints given exactly those that are ``known`` (22,)."""
