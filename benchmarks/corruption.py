@@ -68,6 +68,15 @@ def swapped(seen: Floats, rng: np.random.Generator, rate: float = 0.02, mean_fra
     return out
 
 
+def sides_exchanged(seen: Floats, rng: np.random.Generator, frames: int = 30, first: int = 20) -> Floats:
+    """Exchange left and right of every clip's whole body for ``frames`` frames. It starts at a random time from frame
+    ``first`` on and ends at least a third of a second before the clip does."""
+    starts = rng.integers(first, len(seen) - frames - 10, endpoint=True, size=seen.shape[1])
+    time = np.arange(len(seen))[:, None]
+    on = (time >= starts) & (time < starts + frames)
+    return np.where(on[..., None, None], seen[:, :, MIRROR], seen)
+
+
 def below(truth: Floats, height: float = 0.9) -> Mask:
     """Return the joints (T, C, J) lower than ``height`` metres (HuMoR's occlusion)."""
     return truth[..., 2] < height

@@ -13,7 +13,7 @@ from steadypose.benchmarks import figures
 from steadypose.benchmarks.baselines import flk
 from steadypose.benchmarks.baselines.filters import FILTERS, Baseline
 from steadypose.benchmarks.bench import Bench
-from steadypose.benchmarks.corruption import correlated, gaussian, spiked, swapped
+from steadypose.benchmarks.corruption import correlated, gaussian, sides_exchanged, spiked, swapped
 from steadypose.benchmarks.provenance import VARIANTS_22
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import pivot
@@ -36,9 +36,11 @@ CONDITIONS: dict[str, Condition] = {
     "lasting 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
     "1 cm, spikes": lambda truth, rng: spiked(gaussian(truth, 0.01, rng), rng),
     "1 cm, swaps": lambda truth, rng: swapped(gaussian(truth, 0.01, rng), rng),
+    "1 cm, sides": lambda truth, rng: sides_exchanged(gaussian(truth, 0.01, rng), rng),
     "lasting 2 cm, spikes, swaps": lambda truth, rng: spiked(swapped(correlated(truth, 0.02, rng), rng), rng),
 }
-"""Conditions by standard deviation along an axis; "lasting": correlation 0.9 between frames."""
+"""Conditions by standard deviation along an axis; "lasting": correlation 0.9 between frames; "swaps": limbs exchanged
+for a few frames; "sides": the whole body exchanged for a second."""
 
 
 def run(bench: Bench) -> Result:

@@ -31,11 +31,15 @@ LASTS = 4
 SIGMA = 0.03
 """Standard deviation of joints along an axis, when postures are compared, metres."""
 
-MARGIN = 5.0
-"""Least difference of log-likelihoods at which a body's first frame is taken for exchanged."""
+FIRST = 15
+"""Largest number of a body's first frames that are tested, until the order in which it is given is the likeliest."""
+
+RATIO, MARGIN = 1.25, 5.0
+"""A body's first frame is taken for exchanged if its misfit exceeds this multiple of the exchanged one's by this margin
+(validation: none of 7,500 right frames, with noise of 4 cm one; of exchanged bodies 98.6 and 92 % are found)."""
 
 MEMORY = 9
-"""Length of the running mean of log-likelihoods, frames."""
+"""Length of the running mean of misfits, frames."""
 
 _CHAINS = ("elbow", "wrist"), ("knee", "ankle", "foot")
 _LIMBS = tuple(np.concatenate(limbs(chain)) for chain in _CHAINS)
@@ -68,29 +72,33 @@ class ExchangedLimbs:
     def __init__(self, patience_s: float, slots: int) -> None:
         self._patience = patience_s * FPS
         self._posture = LivePosture.load("default")
-        self._begun = np.zeros(slots, dtype=bool)
+        self._tests = np.full(slots, FIRST)
         self._since = np.zeros((slots, len(_LIMBS)))  # frames put back less frames not put back
         self._misfit = np.zeros((slots, len(_ORDERS)))
         self._frames = np.zeros(slots)
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        for values in (self._begun, self._since, self._misfit, self._frames):
+        self._tests[slot] = FIRST
+        for values in (self._since, self._misfit, self._frames):
             values[slot] = 0
 
     def begin(self, positions: Floats) -> Bools:
-        """Put back, in place, limbs of (S, 22, 3) metres, NaN where unobserved, of bodies whose hips and shoulders are
-        observed for the first time. Return the joints (S, 22) that were.
+        """Put back, in place, limbs of (S, 22, 3) metres, NaN where unobserved, of bodies in whose first frames another
+        order is likelier. Return the joints (S, 22) that were.
         """
         back = np.zeros(positions.shape[:2], dtype=bool)
-        for slot in np.flatnonzero(~self._begun & np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)):
-            self._begun[slot] = True
+        seen = np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)
+        for slot in np.flatnonzero((self._tests > 0) & seen):
+            self._tests[slot] -= 1
             misfit = self._posture.misfit(positions[slot, _ORDERS], SIGMA)
             best = int(misfit.argmin())
-            if misfit[0] - misfit[best] > MARGIN:
+            if misfit[0] > RATIO * misfit[best] + MARGIN:
                 positions[slot] = positions[slot, _ORDERS[best]]
                 back[slot] = _ORDERS[best] != np.arange(22)
                 self._since[slot], self._misfit[slot], self._frames[slot] = LASTS * _EXCHANGED[:, best], misfit, 1
+            if back[slot].any() or best == 0:
+                self._tests[slot] = 0
         return back
 
     def update(self, positions: Floats, expected: Floats, distance: Floats) -> tuple[int, Bools]:

@@ -85,10 +85,10 @@ class Gate:
         expected = self._filter.predict(observation.stamp_s)
         if expected is not None:
             distance = distances(positions, expected.positions)
-            if s.enabled and self._put_back(positions, expected, distance):
-                distance = distances(positions, expected.positions)
             jitter = self._jitter.copy()
             self._measure_jitter(distance)
+            if s.enabled and self._put_back(positions, expected, distance):
+                distance = distances(positions, expected.positions)
             if s.enabled:
                 mirrored = self._reject(positions, expected, distance, observation.sensor_position)
                 self._jitter = np.where(self._bad_frames > 0, jitter, self._jitter)

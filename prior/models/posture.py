@@ -76,13 +76,13 @@ class LivePosture:
     """The Gaussian of `steadypose train posture`.
 
     ``spread`` is a factor on its covariance: how much more people may differ from the mean than training people do.
-    ``covariance`` (66, 66) is of the joints of an adult in the trunk's frame, m².
+    ``mean`` (66,) metres and ``covariance`` (66, 66) m² are of the joints of an adult in the trunk's frame.
     """
 
     def __init__(self, weights: Arrays, spread: float = 1.0) -> None:
         factor = weights["factor"].astype(np.float64)
         whole, mean = spread * factor @ factor.T, weights["mean"].astype(np.float64)
-        self._mean, self._turn = mean[:DIMENSIONS], mean[DIMENSIONS:]
+        self.mean, self._turn = mean[:DIMENSIONS], mean[DIMENSIONS:]
         self.covariance = whole[:DIMENSIONS, :DIMENSIONS] + UNLIKE**2 * np.eye(DIMENSIONS)
         self._turned_by = np.linalg.solve(self.covariance, whole[:DIMENSIONS, DIMENSIONS:]).T
 
@@ -100,11 +100,11 @@ class LivePosture:
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
         noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
-        off, left = local.reshape(len(local), -1) - self._mean, np.empty((len(local), DIMENSIONS, DIMENSIONS))
+        off, left = local.reshape(len(local), -1) - self.mean, np.empty((len(local), DIMENSIONS, DIMENSIONS))
         _condition(self.covariance, noise, off, left)
-        local = (self._mean + off).reshape(local.shape)
+        local = (self.mean + off).reshape(local.shape)
         expected, left = on_bones(local * scale, left * scale**2, np.ascontiguousarray(lengths[:, 1:]))
-        off = (expected / scale).reshape(len(local), -1) - self._mean
+        off = (expected / scale).reshape(len(local), -1) - self.mean
         root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
         turned = self._turned_by @ left @ self._turned_by.T / scale**2
         variance = np.diagonal(left, axis1=1, axis2=2).reshape(-1, 22, 3).mean(axis=-1)
@@ -122,7 +122,7 @@ class LivePosture:
         size = float(np.median(bones[seen] / REST_LENGTHS[seen])) if seen.any() else 1.0
         middle = positions[:, list(_CORNERS)].mean(axis=1)
         local = (positions - middle[:, None]) @ trunk_frame(positions) / size
-        off = local[:, known].reshape(len(local), -1) - self._mean.reshape(22, 3)[known].ravel()
+        off = local[:, known].reshape(len(local), -1) - self.mean.reshape(22, 3)[known].ravel()
         rows = np.repeat(known, 3)
         covariance = self.covariance[np.ix_(rows, rows)] + sigma**2 * np.eye(int(rows.sum()))
         return 0.5 * (off.T * np.linalg.solve(covariance, off.T)).sum(axis=0)

@@ -3,7 +3,7 @@ import pytest
 
 from steadypose.benchmarks import corruption
 from steadypose.benchmarks.corruption import LIMBS, arm_behind, below, hide
-from steadypose.prior.body.skeleton import REST_POSITIONS, J
+from steadypose.prior.body.skeleton import MIRROR, REST_POSITIONS, J
 
 SHAPE = (300, 6, 22, 3)
 
@@ -39,6 +39,16 @@ def test_exchanged_limbs_are_whole_and_come_back() -> None:
     np.testing.assert_array_equal(seen[on][:, right], truth[on][:, left])
     kept = [j for j in range(22) if j not in np.concatenate(LIMBS)]
     np.testing.assert_array_equal(seen[:, :, kept], truth[:, :, kept])
+
+
+def test_sides_are_exchanged_for_as_long_as_asked_and_leave_time_to_find_it() -> None:
+    truth = np.random.default_rng(0).normal(size=(90, 5, 22, 3))
+    seen = corruption.sides_exchanged(truth, np.random.default_rng(1), frames=30, first=20)
+    on = (seen != truth).any(axis=(2, 3))
+    assert (on.sum(axis=0) == 30).all()
+    assert not on[:20].any()
+    assert not on[-10:].any()
+    assert (seen[on] == truth[on][:, MIRROR]).all()
 
 
 def test_bursts_take_one_limb_for_as_long_as_asked_and_leave_time_to_find_it() -> None:

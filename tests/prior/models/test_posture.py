@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.kinematics import to_rotation_vectors
-from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, J
+from steadypose.prior.body.skeleton import HIPS, JOINTS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
 from steadypose.prior.models.posture import (
     LEAST_SIGMA,
     LENGTH_SIGMA,
@@ -14,9 +15,11 @@ from steadypose.prior.models.posture import (
     on_bones,
     rigid_covariance,
     rigid_pelvis,
+    trunk_frame,
 )
 
 BODIES = 60
+POSED = [*HIPS, *SHOULDERS]
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +47,24 @@ def test_a_joint_of_which_nothing_is_said_follows_the_others(posture: LivePostur
     off[:, J["spine3"]] += 0.3
     expected = posture(off, sigma, LENGTHS).positions
     assert np.median(np.linalg.norm(expected - joints, axis=-1)[:, J["spine3"]]) < 0.05
+
+
+@pytest.mark.parametrize("hidden", [(), ("left_wrist", "right_foot")])
+def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePosture, hidden: tuple[str, ...]) -> None:
+    body = REST_POSITIONS + np.random.default_rng(6).normal(0.0, 0.03, (4, 22, 3))
+    body[1:, POSED] = body[:1, POSED]  # the frame and the size of all are those of the first
+    known = np.array(
+        [not {name, name.replace("left", "right"), name.replace("right", "left")} & {*hidden} for name in JOINTS]
+    )
+    middle = body[0, [*HIPS, *SHOULDERS]].mean(axis=0)
+    size = np.median(np.linalg.norm(body[0, 1:] - body[0, PARENT[1:]], axis=-1)[known[1:]] / LENGTHS[0, 1:][known[1:]])
+    local = (body - middle) @ trunk_frame(body[:1])[0] / size
+    rows = np.repeat(known, 3)
+    covariance = posture.covariance[np.ix_(rows, rows)] + 0.03**2 * np.eye(rows.sum())
+    likely = multivariate_normal.logpdf(local.reshape(4, -1)[:, rows], posture.mean[rows], covariance)
+    body[:, [J[name] for name in hidden]] = np.nan
+    misfit = posture.misfit(body, 0.03)
+    np.testing.assert_allclose(misfit - misfit[0], likely[0] - likely, atol=1e-6)
 
 
 def test_bones_keep_the_persons_lengths(posture: LivePosture, joints: np.ndarray) -> None:
