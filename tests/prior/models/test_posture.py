@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -60,7 +62,7 @@ def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePo
     size = np.median(np.linalg.norm(body[0, 1:] - body[0, PARENT[1:]], axis=-1)[known[1:]] / LENGTHS[0, 1:][known[1:]])
     local = (body - middle) @ trunk_frame(body[:1])[0] / size
     rows = np.repeat(known, 3)
-    covariance = posture.covariance[np.ix_(rows, rows)] + 0.03**2 * np.eye(rows.sum())
+    covariance: Any = posture.covariance[np.ix_(rows, rows)] + 0.03**2 * np.eye(rows.sum())
     likely = multivariate_normal.logpdf(local.reshape(4, -1)[:, rows], posture.mean[rows], covariance)
     body[:, [J[name] for name in hidden]] = np.nan
     misfit = posture.misfit(body, 0.03)
