@@ -120,6 +120,31 @@ def test_exchanged_sides_are_put_back_from_the_first_frame_on_and_for_seconds(
     assert np.array_equal(passed, positions)
 
 
+def test_sides_of_a_body_whose_first_frame_is_no_posture_are_put_back_from_the_next_on() -> None:
+    positions = noisy(90, 0.01)
+    seen = positions.copy()
+    seen[:20] = positions[:20][:, MIRROR]
+    seen[0] += np.random.default_rng(3).normal(0.0, 0.15, (22, 3))
+    passed, _ = run(seen)
+    assert np.array_equal(passed[0], seen[0])
+    assert np.array_equal(passed[20:], positions[20:])
+    limbs = limbs_of("knee", "ankle", "elbow", "wrist")
+    assert np.nanmax(np.linalg.norm(passed[1:] - positions[1:], axis=-1)[:, limbs]) < 1e-9
+
+
+@pytest.mark.parametrize(("order", "exchanged"), [("arms", slice(30, 80)), ("whole", slice(54, 58))])
+def test_arms_that_meet_while_they_are_exchanged_are_put_back_too(order: str, exchanged: slice) -> None:
+    positions = noisy(90, 0.002)
+    apart = np.interp(np.arange(90), [30, 50, 60, 80], [1.0, 0.15, 0.15, 1.0])
+    arms = limbs_of("elbow", "wrist")
+    middle = 0.5 * (positions[:, arms] + positions[:, MIRROR[arms]])
+    positions[:, arms] = middle + apart[:, None, None] * (positions[:, arms] - middle)
+    seen = positions.copy()
+    seen[exchanged] = positions[exchanged][:, SIDES[order]]
+    passed, _ = run(seen)
+    assert np.array_equal(passed, positions)
+
+
 def test_a_body_that_faces_the_other_way_all_at_once_is_believed_before_long() -> None:
     """An estimator that takes somebody's back for the front exchanges sides too, but what it says is a posture."""
     positions = noisy(90, 0.01)
