@@ -111,7 +111,7 @@ class ExchangedLimbs:
         if not (self._since.any() or (distance > APART).any()):
             return 0, given_up
         keep, swap = np.stack([_kept_and_exchanged(positions, expected, pair) for pair in _LIMBS], axis=-1)
-        far = (keep > APART) & (swap < BETTER * keep)  # NaN, so False, if a joint is unseen
+        far = (keep > APART) & (swap < BETTER * keep)  # NaN, so False, if nothing is seen on both sides
         # while an exchange lasts, or if other limbs are exchanged, limbs beside each other are too
         jumped = far | (swap < keep) & ((self._since >= LASTS) | far.any(axis=1, keepdims=True))
         # most frames are right, so one exchanged frame does not confirm another at the beginning
@@ -141,11 +141,13 @@ class ExchangedLimbs:
 
 
 def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """(S,) metres, mean distance of the joints ``pair`` to their predictions: as observed, and with sides exchanged."""
-    return (
-        distances(positions[:, pair], expected[:, pair]).mean(axis=1),
-        distances(positions[:, MIRROR[pair]], expected[:, pair]).mean(axis=1),
-    )
+    """(S,) metres, mean distance of the joints ``pair`` that are observed on both sides to their predictions: as
+    observed, and with sides exchanged; NaN if there is none."""
+    keep = distances(positions[:, pair], expected[:, pair])
+    swap = distances(positions[:, MIRROR[pair]], expected[:, pair])
+    both = np.isfinite(keep + swap)
+    count = np.where(both.any(axis=1), both.sum(axis=1), np.nan)
+    return np.where(both, keep, 0.0).sum(axis=1) / count, np.where(both, swap, 0.0).sum(axis=1) / count
 
 
 def _put_back(positions: Floats, exchanged: Bools, pair: NDArray[np.intp]) -> None:

@@ -120,6 +120,15 @@ def test_exchanged_sides_are_put_back_from_the_first_frame_on_and_for_seconds(
     assert np.array_equal(passed, positions)
 
 
+def test_sides_are_put_back_while_a_joint_is_hidden() -> None:
+    positions = noisy(90, 0.01)
+    positions[40:60, WRIST] = np.nan
+    seen = positions.copy()
+    seen[30:80] = positions[30:80][:, MIRROR]
+    passed, _ = run(seen)
+    assert np.array_equal(passed, positions, equal_nan=True)
+
+
 def test_sides_of_a_body_whose_first_frame_is_no_posture_are_put_back_from_the_next_on() -> None:
     positions = noisy(90, 0.01)
     seen = positions.copy()
