@@ -111,7 +111,9 @@ class ExchangedLimbs:
         if not (self._since.any() or (distance > APART).any()):
             return 0, given_up
         keep, swap = np.stack([_kept_and_exchanged(positions, expected, pair) for pair in _LIMBS], axis=-1)
-        far = (keep > APART) & (swap < BETTER * keep)  # NaN, so False, if nothing is seen on both sides
+        hidden = np.isfinite(expected[..., 0]) & np.isnan(distance)
+        whole = np.stack([~hidden[:, pair].any(axis=1) for pair in _LIMBS], axis=-1)
+        far = whole & (keep > APART) & (swap < BETTER * keep)
         # while an exchange lasts, or if other limbs are exchanged, limbs beside each other are too
         jumped = far | (swap < keep) & ((self._since >= LASTS) | far.any(axis=1, keepdims=True))
         # most frames are right, so one exchanged frame does not confirm another at the beginning

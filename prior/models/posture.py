@@ -118,7 +118,7 @@ class LivePosture:
         """
         known = np.isfinite(positions[0, :, 0]) & np.isfinite(positions[0, MIRROR, 0])
         bones = np.linalg.norm(positions[0] - positions[0, PARENT], axis=-1)
-        seen = known & (REST_LENGTHS > 0.0)
+        seen = known & known[PARENT] & (REST_LENGTHS > 0.0)
         size = float(np.median(bones[seen] / REST_LENGTHS[seen])) if seen.any() else 1.0
         middle = positions[:, list(_CORNERS)].mean(axis=1)
         local = (positions - middle[:, None]) @ trunk_frame(positions) / size

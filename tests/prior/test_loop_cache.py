@@ -158,8 +158,8 @@ USES = """
 import sys
 import numpy as np
 from steadypose.prior.body.kinematics import from_rotation_vectors
-from steadypose.prior.clean.gate import _apart
-print(_apart(np.zeros((1, 1, 3)), np.ones((1, 1, 3)))[0, 0], from_rotation_vectors(np.zeros(3)).trace())
+from steadypose.prior.clean.exchanged import distances
+print(distances(np.zeros((1, 1, 3)), np.ones((1, 1, 3)))[0, 0], from_rotation_vectors(np.zeros(3)).trace())
 print(*(name for name in sys.modules if name in ("numba.np.arrayobj", "numba.cpython.unicode")))
 """
 

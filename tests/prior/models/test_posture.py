@@ -51,7 +51,9 @@ def test_a_joint_of_which_nothing_is_said_follows_the_others(posture: LivePostur
     assert np.median(np.linalg.norm(expected - joints, axis=-1)[:, J["spine3"]]) < 0.05
 
 
-@pytest.mark.parametrize("hidden", [(), ("left_wrist", "right_foot")])
+@pytest.mark.parametrize(
+    "hidden", [(), ("left_wrist", "right_foot"), ("spine1", "spine2", "left_collar", "right_collar")]
+)
 def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePosture, hidden: tuple[str, ...]) -> None:
     body = REST_POSITIONS + np.random.default_rng(6).normal(0.0, 0.03, (4, 22, 3))
     body[1:, POSED] = body[:1, POSED]  # the frame and the size of all are those of the first
@@ -59,7 +61,8 @@ def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePo
         [not {name, name.replace("left", "right"), name.replace("right", "left")} & {*hidden} for name in JOINTS]
     )
     middle = body[0, [*HIPS, *SHOULDERS]].mean(axis=0)
-    size = np.median(np.linalg.norm(body[0, 1:] - body[0, PARENT[1:]], axis=-1)[known[1:]] / LENGTHS[0, 1:][known[1:]])
+    both = known[1:] & known[PARENT[1:]]
+    size = np.median(np.linalg.norm(body[0, 1:] - body[0, PARENT[1:]], axis=-1)[both] / LENGTHS[0, 1:][both])
     local = (body - middle) @ trunk_frame(body[:1])[0] / size
     rows = np.repeat(known, 3)
     covariance: Any = posture.covariance[np.ix_(rows, rows)] + 0.03**2 * np.eye(rows.sum())
