@@ -23,15 +23,12 @@ from steadypose.benchmarks.results import load
 _SIDES = "measured before sides were put back in layouts without collars; a bundled stream changed by 0.1 %"
 STALE: dict[str, str] = {
     **dict.fromkeys(
-        (
-            "counter", "events", "heading", "kinect_vicon", "latency", "layouts", "mediapipe", "restart", "retarget",
-            "scale",
-        ),
+        ("events", "kinect_vicon", "latency", "restart", "retarget", "scale"),
         _SIDES,
     ),
     "ablations": f"{_SIDES}; and before the noise study had a condition more",
     "soak": "measured before the steady stage and the fast matrix products, on which its losses depend little",
-}  # fmt: skip
+}
 """Results that are kept although what they measured has changed since, each with the reason. A test compares this list
 with the code (`provenance.stale`)."""
 
