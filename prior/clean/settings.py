@@ -45,7 +45,8 @@ class GateSettings:
     jump: float = 0.18
     """metres that a joint may be from its prediction, in addition to three standard deviations of the prediction"""
     patience: float = 0.3
-    """seconds after which a joint that is rejected (or a limb that is exchanged) in every frame is accepted"""
+    """seconds after which a joint that is rejected in every frame is accepted, and a limb that is exchanged in every
+    frame, unless only so it makes a human posture"""
     min_confidence: float = 0.1
     """joints of lower confidence count as unobserved"""
 

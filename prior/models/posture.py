@@ -51,6 +51,9 @@ WITHIN = np.radians((1.5, 4.0, 5.0))
 DEPENDENT = 1.7
 """Factor on the covariance of the averaged root, because the two estimates share most noise (validation people)."""
 
+MIN_SIZE = 0.05
+"""Least size of a body whose postures are compared, relative to an adult's: joints may coincide."""
+
 _CORNERS = (*HIPS, *SHOULDERS)
 _REST_SIZE = float(REST_LENGTHS.sum())
 
@@ -119,7 +122,7 @@ class LivePosture:
         known = np.isfinite(positions[0, :, 0]) & np.isfinite(positions[0, MIRROR, 0])
         bones = np.linalg.norm(positions[0] - positions[0, PARENT], axis=-1)
         seen = known & known[PARENT] & (REST_LENGTHS > 0.0)
-        size = float(np.median(bones[seen] / REST_LENGTHS[seen])) if seen.any() else 1.0
+        size = max(float(np.median(bones[seen] / REST_LENGTHS[seen])), MIN_SIZE) if seen.any() else 1.0
         middle = positions[:, list(_CORNERS)].mean(axis=1)
         local = (positions - middle[:, None]) @ trunk_frame(positions) / size
         off = local[:, known].reshape(len(local), -1) - self.mean.reshape(22, 3)[known].ravel()

@@ -72,6 +72,10 @@ def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePo
     np.testing.assert_allclose(misfit - misfit[0], likely[0] - likely, atol=1e-6)
 
 
+def test_joints_that_coincide_have_a_misfit(posture: LivePosture) -> None:
+    assert np.isfinite(posture.misfit(np.ones((2, 22, 3)), 0.03)).all()
+
+
 def test_bones_keep_the_persons_lengths(posture: LivePosture, joints: np.ndarray) -> None:
     noisy = joints + np.random.default_rng(4).normal(0.0, 0.03, joints.shape)
     expected = posture(noisy, np.full((BODIES, 22), 0.03), LENGTHS).positions
