@@ -43,9 +43,7 @@ def test_the_wrapper_runs_where_the_caller_stands(checkout: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("version", [(3, 9), (3, 14), None])
-def test_a_python_that_cannot_be_used_is_not_taken(
-    checkout: Path, tmp_path: Path, version: tuple[int, int] | None
-) -> None:
+def test_a_python_that_cannot_be_used_is_not_taken(checkout: Path, tmp_path: Path, version: tuple[int, int] | None):
     shutil.rmtree(checkout / ".venv")
     names = tmp_path / "bin"
     names.mkdir()

@@ -128,9 +128,7 @@ def test_what_no_commit_can_make_again_is_refused_among_the_results_alone(tmp_pa
     assert saved(tmp_path)
 
 
-def test_a_result_is_stale_when_weights_or_what_made_it_have_changed_and_a_finished_one_never(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_is_stale_when_weights_or_code_have_changed_and_a_finished_one_never(tmp_path: Path, monkeypatch):
     result = saved(tmp_path)
     assert stale(result) == []
     assert {"CONDITIONS", "run", "below", "ConditionalGaussian", "RIDGE", "search"} <= {

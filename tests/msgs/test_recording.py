@@ -422,9 +422,7 @@ def test_a_topic_of_another_time_splits_no_part(tmp_path: Path):
     assert len(list((tmp_path / "recording").glob("*.mcap"))) == 1
 
 
-def test_the_oldest_parts_go_where_there_is_a_limit_and_those_that_somebody_removes_may(
-    tmp_path: Path,
-) -> None:
+def test_the_oldest_parts_go_where_there_is_a_limit_and_those_that_somebody_removes_may(tmp_path: Path) -> None:
     directory = tmp_path / "recording"
     record(directory, stream(), split_bytes=50_000, keep_bytes=200_000)
     assert sum(path.stat().st_size for path in directory.glob("*.mcap")) <= 200_000

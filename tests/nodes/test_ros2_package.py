@@ -76,9 +76,7 @@ def change(graph: Any, transition: str) -> bool:
     return call(graph, ChangeState, "change_state", ChangeState.Request(transition=wanted)).success
 
 
-def test_a_lifecycle_starts_and_ends_the_program(
-    graph: Any, start: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_a_lifecycle_starts_and_ends_the_program(graph: Any, start: Callable[..., Any], tmp_path: Path):
     launch = tmp_path / "mine.toml"
     launch.write_text('nodes = ["pose_input", "ros2_bridge"]\n[transport]\nlossless = false\n')
     recording = Path(__file__).parents[2] / "sim_data/walk_turn"

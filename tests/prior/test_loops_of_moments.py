@@ -75,9 +75,7 @@ def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, mi
 
 @settings(deadline=None, max_examples=20)
 @given(SEEDS, MISSING, st.integers(0, 4))
-def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_noise(
-    seed: int, missing: float, back: int
-) -> None:
+def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_noise(seed: int, missing: float, back: int):
     rng = np.random.default_rng(seed)
     frames, stage, history = observed(rng, missing), Denoise(back, SLOTS), History(8, SLOTS)
     jitter = rng.uniform(0.0, 0.02, SLOTS)

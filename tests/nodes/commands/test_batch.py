@@ -206,9 +206,7 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
         ("in/a.npz", "out", {"jobs": 2}, "--jobs: expected a folder"),
     ],
 )
-def test_what_cannot_be_done_is_said(
-    tmp_path: Path, source: str, out: str, more: dict[str, Any], expected: str
-) -> None:
+def test_what_cannot_be_done_is_said(tmp_path: Path, source: str, out: str, more: dict[str, Any], expected: str):
     for name in ("in", "used", "empty", "twice"):
         (tmp_path / name).mkdir()
     write_npz(tmp_path / "in" / "a.npz", WALK)

@@ -127,9 +127,7 @@ def test_what_cannot_be_done_is_said(arguments: list[str], complaint: str, tmp_p
     assert (launch.read_text(), lens.read_text()) == ("", LENS_TOLD), "left as they were"
 
 
-def test_the_floor_seen_in_depth_tells_height_and_tilt_and_the_launch_file_is_whole_whatever_happens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_floor_in_depth_tells_height_and_tilt_and_the_launch_file_stays_whole(tmp_path: Path, monkeypatch) -> None:
     launch = tmp_path / "kitchen.toml"
     launch.write_text(LENS_TOLD)
     launch.chmod(0o640)

@@ -86,9 +86,7 @@ def test_what_a_terminal_would_obey_or_the_encoding_of_stdout_lacks_is_escaped(t
         ),
     ],
 )
-def test_files_that_are_something_else_are_refused_in_a_line(
-    capsys, tmp_path: Path, arguments: list[str], expected: str
-) -> None:
+def test_other_files_are_refused_in_a_line(capsys, tmp_path: Path, arguments: list[str], expected: str) -> None:
     (tmp_path / "text.npz").write_text("hello")
     (tmp_path / "text.safetensors").write_text("hello, world")
     np.savez(tmp_path / "other.npz", a=1)

@@ -108,8 +108,8 @@ def test_another_python_and_a_busy_processor_are_told(monkeypatch: pytest.Monkey
     ("runtime", "verdict", "found"),
     [(".", Verdict.GOOD, "latency"), ("file", Verdict.BAD, "Not a directory"), ("x" * 100, Verdict.BAD, "too long")],
 )
-def test_a_message_makes_its_way_where_sockets_can_be(
-    runtime: str, verdict: Verdict, found: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_message_arrives_where_sockets_can_be(
+    runtime: str, verdict: Verdict, found: str, monkeypatch, tmp_path
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / runtime))
@@ -120,9 +120,7 @@ def test_a_message_makes_its_way_where_sockets_can_be(
 
 
 @pytest.mark.parametrize("content", [None, b"\x08\0\0\0\0\0\0\0garbage!"])
-def test_missing_or_damaged_weights_are_told_and_nothing_is_timed(
-    content: bytes | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_missing_or_damaged_weights_are_told_and_nothing_is_timed(content: bytes | None, monkeypatch, tmp_path: Path):
     for model in checks.MODELS if content else ():
         (tmp_path / f"{model}-default.safetensors").write_bytes(content or b"")
     monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path)

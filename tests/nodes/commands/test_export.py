@@ -36,9 +36,7 @@ def motion() -> BodyMotion:
     return BodyMotion(30.0, root, rotations.reshape(FRAMES, 22, 4), 1.1 * REST_OFFSETS)
 
 
-def npz(
-    path: Path, motion: BodyMotion, turn: Rotation | None = None, gap: slice = slice(0), backwards: bool = False
-) -> Path:
+def npz(path: Path, motion: BodyMotion, turn: Rotation | None = None, gap=slice(0), backwards: bool = False) -> Path:
     """What ``clean`` writes of it, from a sensor whose axes are turned, in all frames or in each, without anybody in a
     gap."""
     turn = turn or Rotation.identity()
@@ -205,7 +203,7 @@ def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: F
     ],
 )
 def test_what_cannot_be_written_is_said(
-    source: str, out: str, more: list[str], said: str, tmp_path: Path, motion: BodyMotion, capsys
+    source: str, out: str, more: list[str], said: str, tmp_path, motion, capsys
 ) -> None:
     npz(tmp_path / "clean.npz", motion)
     npz(tmp_path / "back.npz", motion, backwards=True)
@@ -245,9 +243,7 @@ def test_a_vrm_animation_rests_in_a_t_and_names_its_humanoid(tmp_path: Path, mot
 
 
 @pytest.mark.parametrize(("names", "elbow"), [("vrm", "leftLowerArm"), ("mixamo", "mixamorig:LeftForeArm")])
-def test_joints_have_the_names_of_the_rig_that_is_asked_for(
-    tmp_path: Path, motion: BodyMotion, names: str, elbow: str
-) -> None:
+def test_joints_have_the_names_of_the_rig_that_is_asked_for(tmp_path: Path, motion: BodyMotion, names: str, elbow: str):
     source = npz(tmp_path / "in.npz", motion)
     for out in ("take.bvh", "take.glb"):
         assert main(["export", str(source), str(tmp_path / out), "--names", names]) == 0

@@ -130,9 +130,7 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
         ("keys.npz", "out", "expected an .npz"),
     ],
 )
-def test_what_cannot_be_done_is_said(
-    source: str, out: str, says: str, seen: Path, pictured: Path, tmp_path: Path, capsys
-) -> None:
+def test_what_cannot_be_done_is_said(source: str, out: str, says: str, seen, pictured, tmp_path, capsys) -> None:
     write_npz(tmp_path / "empty.npz", np.full((FRAMES, 22, 3), np.nan))
     assert main(["fit", str(tmp_path / source), str(tmp_path / out)]) == 2
     assert says in capsys.readouterr().err

@@ -51,9 +51,7 @@ def test_echo_gives_a_line_a_message_and_a_line_a_body(recording: Path, capsys: 
     assert "average rate: 30.000 Hz  min: 0.0333 s  max: 0.0333 s" in capsys.readouterr().out
 
 
-def test_echo_tells_of_the_world_of_nodes_and_of_a_body_that_is_not_seen(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_echo_tells_of_the_world_of_nodes_and_of_a_body_that_is_not_seen(recording: Path, tmp_path: Path, capsys):
     echo(str(recording), topics=(POSE_WORLD, DIAGNOSTICS))
     out = capsys.readouterr().out
     assert "0.50 m/s, ok" in out

@@ -248,9 +248,7 @@ def pictured(image: np.ndarray, at: np.ndarray) -> bool:
     return bool(np.abs(image[y - 2 : y + 3, x - 2 : x + 3] - 90).max() > 60)
 
 
-def test_raw_and_clean_stand_side_by_side_where_the_camera_saw_them(
-    tmp_path: Path, cleaned: list[PoseClean], video: Path
-) -> None:
+def test_raw_and_clean_stand_where_the_camera_saw_them(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     plot(record(tmp_path / "bag", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     written = images(tmp_path / "out.mp4")
     assert len(written) == FRAMES / 2, "15 a second"

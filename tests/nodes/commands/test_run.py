@@ -57,9 +57,7 @@ def test_a_node_that_has_nothing_more_to_do_is_not_started_again(start: Start, s
     assert (child.state, child.restarts) == (state, 0)
 
 
-def test_a_node_that_crashes_starts_again_a_little_later_each_time(
-    start: Start, clock: VirtualClock, said: list[str]
-) -> None:
+def test_a_node_that_crashes_starts_again_a_little_later_each_time(start: Start, clock: VirtualClock, said: list[str]):
     child = start("raise SystemExit(7)")
     child.heard()
     for restarts, pause_s in enumerate([*BACKOFF_S, BACKOFF_S[-1], BACKOFF_S[-1]]):
@@ -75,9 +73,7 @@ def test_a_node_that_crashes_starts_again_a_little_later_each_time(
     assert said[:2] == [f"prior: ended with status 7; starting it again in {pause} s" for pause in ("0", "0.5")]
 
 
-def test_a_node_that_was_never_heard_has_failed_at_last_and_one_that_ran_for_a_while_gets_new_chances(
-    start: Start, clock: VirtualClock
-) -> None:
+def test_a_node_never_heard_has_failed_at_last_and_one_that_ran_gets_new_chances(start: Start, clock: VirtualClock):
     child, heard = start("raise SystemExit(7)"), start("raise SystemExit(7)")
     for crashes in range(1, TRIES):
         ended(child)
@@ -92,9 +88,7 @@ def test_a_node_that_was_never_heard_has_failed_at_last_and_one_that_ran_for_a_w
         assert heard.state == "running", "again, and at once"
 
 
-def test_a_node_that_falls_silent_is_stale_then_killed_and_started_again(
-    start: Start, clock: VirtualClock, said: list[str]
-) -> None:
+def test_a_node_that_falls_silent_is_killed_and_started_again(start: Start, clock: VirtualClock, said: list[str]):
     child = start(FOREVER)
     later(child, clock, 2 * HUNG_S)
     assert child.state == "running", "the first start may take long"

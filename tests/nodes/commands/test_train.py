@@ -70,9 +70,7 @@ def prepared(path: Path, *minutes: float, sets: tuple[str, ...] = ("default", "r
     return path
 
 
-def test_little_is_said_and_next_to_nothing_refused_before_anything_is_trained(
-    shipped: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_little_and_next_to_nothing_are_refused_before_training(shipped: Path, tmp_path: Path, monkeypatch, capsys):
     np.savez(tmp_path / "other.npz", joints=np.zeros(3))
     for enough in (prepared(tmp_path / "a.npz", 31.0), tmp_path / "other.npz", tmp_path):
         assert command.little_data(enough, "default") == ""

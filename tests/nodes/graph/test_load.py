@@ -223,9 +223,9 @@ def note_for(clock: VirtualClock, limit: BodyLimit, seconds: float, *, busy: flo
 
 
 @pytest.mark.parametrize(("busy", "in_time", "fewer"), [(0.9, 0.7, True), (0.9, 0.98, False), (0.3, 0.7, False)])
-def test_bodies_are_left_out_only_where_they_are_what_takes_the_time(
+def test_bodies_are_left_out_only_where_they_take_the_time(
     clock: VirtualClock, busy: float, in_time: float, fewer: bool
-) -> None:
+):
     limit = BodyLimit(8, clock)
     note_for(clock, limit, 1.2, busy=busy, in_time=in_time)
     assert (limit.bodies < 8) == fewer
@@ -294,9 +294,7 @@ def test_a_server_that_is_late_skips_frames_and_not_bodies() -> None:
     assert server.counters["frames_skipped"] > 10
 
 
-def test_a_tracker_whose_messages_are_dropped_has_not_stopped_and_streams_take_turns(
-    clock: VirtualClock,
-) -> None:
+def test_a_tracker_whose_messages_are_dropped_has_not_stopped_and_streams_take_turns(clock: VirtualClock) -> None:
     checks = StreamChecks(PriorSettings(), 2)
     for source in ("door", "desk"):
         checks.see(dataclasses.replace(raw(0, walking(0)), source=source), clock.time_ns)

@@ -54,9 +54,7 @@ def recorded(start: Any, recording: Path, tmp_path: Path) -> tuple[Run, list[int
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
-def test_ctrl_c_the_end_of_the_terminal_and_a_kill_end_all_and_complete_the_recording(
-    recorded: tuple[Run, list[int]], tmp_path: Path, asked: signal.Signals
-) -> None:
+def test_a_signal_ends_all_and_completes_the_recording(recorded: tuple[Run, list[int]], tmp_path: Path, asked: int):
     run, nodes = recorded
     run.process.send_signal(asked)
     status, output = run.wait()
@@ -191,9 +189,7 @@ def test_a_camera_whose_process_is_killed(start: Any, tmp_path: Path, monkeypatc
     assert 20.0 < float(row[2]) <= 100.0, "the rate is of its own frames in its own time"
 
 
-def test_systemd_is_told_when_all_are_ready_and_that_they_live(
-    folder: Path, recording: Path, start: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_systemd_is_told_when_all_are_ready_and_that_they_live(folder: Path, recording: Path, start: Any, monkeypatch):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(folder / "notify"))
         systemd.settimeout(120)

@@ -3,7 +3,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics
 from steadypose.nodes.graph import loops as loops_module
 from steadypose.nodes.graph import trajectory_node
-from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.loops import _locked, compile_from_the_beginning, compile_from_the_end
 from steadypose.nodes.graph.node import SUPERVISOR, WATCHER
 from steadypose.nodes.graph.process import own_command, own_environment, stop_on_signals
@@ -123,9 +121,7 @@ def test_poses_go_on_where_the_log_cannot_be_written(recording: Path, tmp_path: 
         assert reader.count(POSE_RAW) == 91
 
 
-def test_a_path_may_hold_any_character_and_beside_a_file_in_its_place_a_recording_is_made(
-    start: Any, tmp_path: Path
-) -> None:
+def test_a_path_may_hold_any_character_and_beside_a_file_in_its_place_a_recording_is_made(start: Any, tmp_path: Path):
     strange = tmp_path / 'a 😀 "b\x7f'
     strange.mkdir()
     source = record(strange / "in", walk(30))
@@ -154,9 +150,7 @@ def test_who_watches_hears_the_end_of_a_stream_that_was_over_before(recording: P
 
 
 @pytest.mark.parametrize("lossless", ["true", "false"])
-def test_a_recording_launch_started_again_records_on(
-    tmp_path: Path, make_launch: Callable[..., Launch], recording: Path, lossless: str
-) -> None:
+def test_a_recording_launch_started_again_records_on(tmp_path: Path, make_launch, recording: Path, lossless: str):
     out = tmp_path / "out"
     made = partial(make_launch, recorder__directory=out, transport__lossless=lossless)
     live = made(nodes='["recorder"]')
@@ -210,9 +204,7 @@ def hostile(tmp_path: Path) -> Path:
     ],
     ids=" ".join,
 )
-def test_no_command_runs_what_the_working_folder_holds(
-    arguments: tuple[str, ...], hostile: Path, tmp_path: Path, folder: Path
-) -> None:
+def test_no_command_runs_code_of_the_working_folder(arguments: tuple[str, ...], hostile: Path, tmp_path: Path, folder):
     (tmp_path / "recordings").mkdir()
     (tmp_path / "out").mkdir()
     record(tmp_path / "recordings" / "a", walk(40))
@@ -233,9 +225,7 @@ def test_no_command_runs_what_the_working_folder_holds(
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_a_process_of_our_own_does_not_even_where_python_knows_no_safe_path(
-    hostile: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_of_our_own_does_not_even_where_python_knows_no_safe_path(hostile: Path, tmp_path: Path, monkeypatch):
     old = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
     command = own_command("socket:gethostname")
     assert subprocess.run(command, cwd=hostile, env=old, capture_output=True).returncode != 3

@@ -29,9 +29,7 @@ def recorder(tmp_path: Path, make_launch, clock: VirtualClock, free: SimpleNames
 
 
 @pytest.mark.parametrize(("free_mb", "left"), [(500.0, 10**7), (0.0, 10**5)])
-def test_messages_are_dropped_while_there_is_no_room_and_recorded_again_when_there_is(
-    tmp_path: Path, make_launch, clock: VirtualClock, free: SimpleNamespace, free_mb: float, left: int
-) -> None:
+def test_messages_are_dropped_while_there_is_no_room(tmp_path, make_launch, clock, free, free_mb: float, left: int):
     node = RecorderNode(make_launch(recorder__directory=tmp_path / "out", recorder__free_mb=free_mb), clock)
     node._writer = node._settings.writer()
     for index, frame in enumerate(walk(90)):
@@ -68,9 +66,7 @@ def test_a_disk_that_is_full_before_it_was_noticed(tmp_path: Path, recorder: Rec
     ],
     ids=["back", "one wrong", "two wrong", "the clock was set"],
 )
-def test_log_times_follow_the_stamps_but_neither_back_nor_to_a_wrong_one(
-    stamps: list[int], expected: list[int]
-) -> None:
+def test_log_times_follow_the_stamps_but_neither_back_nor_to_a_wrong_one(stamps: list[int], expected: list[int]):
     log_times = LogTimes()
     assert [log_times.next(POSE_RAW, stamp) for stamp in stamps] == expected
 

@@ -61,7 +61,7 @@ def followed(robot: Robot, stream: list[PoseWorld]) -> tuple[list[RobotPose], ND
 
 
 @pytest.mark.parametrize(
-    "name", ["walk_turn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("sit_rise", "wave_hidden_arm"))]
+    "name", ["walk_turn", *(pytest.param(it, marks=pytest.mark.slow) for it in ("sit_rise", "wave_hidden_arm"))]
 )
 def test_limits_hold_in_every_frame_and_feet_that_stand_stay_within_2_cm(robot: Robot, name: str) -> None:
     poses, away = followed(robot, worlds(name)[:240])
@@ -80,9 +80,8 @@ def test_a_raised_hand_is_raised_and_a_sitting_person_sits(robot: Robot) -> None
     raised, lowest = 0.0, 1.0
     for world in worlds("wave_hidden_arm")[:200]:
         retargeter.follow(world.stamp_ns, world.bodies[0])
-        raised = max(
-            raised, retargeter._solver.frame("left_wrist")[1][2] - retargeter._solver.frame("left_shoulder")[1][2]
-        )
+        wrist, shoulder = (retargeter._solver.frame(f"left_{name}")[1][2] for name in ("wrist", "shoulder"))
+        raised = max(raised, wrist - shoulder)
     retargeter.reset()
     for world in worlds("sit_rise")[:300]:
         retargeter.follow(world.stamp_ns, world.bodies[0])
@@ -110,18 +109,16 @@ def test_feet_stay_above_the_floor_where_a_jumping_body_sinks(robot: Robot) -> N
     stream = worlds("idle")[:75]
     for world in stream[45:]:
         body = world.bodies[0]
-        world.bodies[0] = replace(
-            body, positions=body.positions - [0.0, 0.0, 0.4], contacts=np.zeros(len(CONTACTS), np.float32)
-        )
+        low, contacts = body.positions - [0.0, 0.0, 0.4], np.zeros(len(CONTACTS), np.float32)
+        world.bodies[0] = replace(body, positions=low, contacts=contacts)
     worlds.cache_clear()
     assert faults(robot, followed(robot, stream)[0])["deep_mm"] < 20.0
 
 
 def test_it_begins_and_stops_smoothly(robot: Robot) -> None:
     stream = worlds("walk_turn")[60:180]
-    empty = [
-        PoseWorld(stream[-1].stamp_ns + k * 33_333_333, "world", "x", np.array([0, 0, 1, 0]), []) for k in range(1, 90)
-    ]
+    last = stream[-1]
+    empty = [replace(last, stamp_ns=last.stamp_ns + k * 33_333_333, bodies=[]) for k in range(1, 90)]
     follower = Follower(Retargeter(robot))
     poses = [pose for world in [*stream, *empty] if (pose := follower.process(world))]
     assert len(poses) == len(stream) + len(empty)

@@ -119,9 +119,8 @@ def test_what_is_said_of_bodies_and_nodes(stream: Stream) -> None:
     topics.send(world)
     topics.send(NEWS)
     (poses,), (markers,) = kept.of("steadypose/poses"), kept.of("steadypose/markers")
-    for body, found in zip(
-        world.bodies, np.array([xyz(it.position) for it in poses.poses]).reshape(2, 22, 3), strict=True
-    ):
+    placed = np.array([xyz(it.position) for it in poses.poses]).reshape(2, 22, 3)
+    for body, found in zip(world.bodies, placed, strict=True):
         np.testing.assert_array_equal(found, body.positions)
 
     marks = {mark.ns: mark for mark in markers.markers}
@@ -168,7 +167,7 @@ def test_the_whole_message_goes_out_in_its_own_type_and_transforms_lead_to_every
     told = kept.of("tf")[-1]
     buffer.add(told, static=False)
     assert {it.child_frame_id for it in told.transforms} == {
-        f"{link}_{body}" for link in LINKS for body in ("b0", "b1")
+        f"{link}_{name}" for link in LINKS for name in ("b0", "b1")
     }
     for name, body in zip(("b0", "b1"), world.bodies, strict=True):
         for link, (place, turned) in frames(body).items():
@@ -237,9 +236,7 @@ def test_the_urdf_is_of_mean_lengths_and_changes_with_them_alone(stream: Stream)
     assert counts[0] < counts[1] < 20
 
 
-def test_sources_have_bodies_of_their_own_until_they_fall_silent(
-    make_launch: Callable[..., Launch], clock: VirtualClock, stream: Stream
-) -> None:
+def test_sources_have_bodies_of_their_own_until_they_fall_silent(make_launch, clock: VirtualClock, stream: Stream):
     """Of a server's clients, each numbers its bodies from 0."""
     kept, node = Kept(), Ros2BridgeNode(make_launch(nodes='["trajectory", "ros2_bridge"]'), clock)
     node._settings = Ros2BridgeSettings()
@@ -283,9 +280,7 @@ def test_without_ros_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("has_dds", [True, False])
-def test_a_sourced_ros_of_another_python_is_not_used(
-    has_dds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ros: None
-) -> None:
+def test_a_sourced_ros_of_another_python_is_not_used(has_dds: bool, tmp_path: Path, monkeypatch, capsys, ros: None):
     """Such as ROS's own Python 3.12 on the path of a 3.11."""
     monkeypatch.setattr(connecting, "has_sourced_ros", lambda: True)
     monkeypatch.setitem(sys.modules, "rclpy", None)

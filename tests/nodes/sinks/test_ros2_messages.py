@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from steadypose.msgs.codec import DEFINITIONS, encode
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.transport import Publisher
 from steadypose.msgs.types import JointState, Message, Tracking
-from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.ros2.definitions import deserialise, ros_types
 from steadypose.nodes.sinks.ros2.bridge import Ros2BridgeNode
 
@@ -124,9 +123,7 @@ def test_ros_gives_each_type_the_hash_that_we_announce(kind: str) -> None:
     assert hashes[f"steadypose_msgs/msg/{kind}"] == ros_types().hash_rihs01(f"steadypose_msgs/msg/{kind}")
 
 
-def test_a_ros_node_receives_whole_messages_from_the_bridge(
-    make_launch: Callable[..., Launch], tmp_path: Path, stream: dict[str, list[Message]]
-) -> None:
+def test_a_ros_node_receives_whole_messages(make_launch, tmp_path: Path, stream: dict[str, list[Message]]):
     launch = make_launch(nodes='["pose_input", "prior", "trajectory", "ros2_bridge"]', transport__lossless="true")
     turn = itertools.cycle(range(60))
     with (

@@ -60,9 +60,7 @@ def test_pages_are_served_and_may_load_nothing_from_elsewhere(server: WebServer)
     assert "Access-Control-Allow-Origin" not in get(server, "/")[1]
 
 
-@pytest.mark.parametrize(
-    "path", ["/../settings.py", "/static/index.html", "//etc/passwd", "/%2e%2e/form.py", "/wsx", "//["]
-)
+@pytest.mark.parametrize("path", ["/../settings.py", "/static/index.html", "//etc/passwd", "/%2e%2e/a", "/wsx", "//["])
 def test_nothing_else_is_served(server: WebServer, path: str) -> None:
     assert get(server, path)[0] == 404
 
@@ -72,9 +70,7 @@ def test_names_of_its_own_are_answered(server: WebServer, host: str) -> None:
     assert get(server, "/", host)[0] == 200
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1.evil.example", "", "localhost:x", "evil.example:80", "[evil"]
-)
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "localhost:x", "evil.it:80", "[evil"])
 @pytest.mark.parametrize("path", ["/", f"/ws?token={TOKEN}"])
 def test_names_that_others_have_pointed_here_are_not(server: WebServer, path: str, host: str) -> None:
     assert get(server, path, host)[0] == 421

@@ -83,9 +83,7 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
     assert pixels(page, BACKGROUND) > 100_000
 
 
-def test_bodies_of_all_clients_of_a_server_are_drawn_under_their_names_until_their_stream_ends(
-    server: WebServer, opened: Any
-) -> None:
+def test_bodies_of_all_clients_are_drawn_under_their_names_until_their_stream_ends(server: WebServer, opened: Any):
     page = opened("/")
     page.evaluate(
         """() => {

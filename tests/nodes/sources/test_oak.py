@@ -92,9 +92,7 @@ def test_the_newest_image_is_there_for_the_viewer(walk: list[Moment], tmp_path: 
 
 
 @pytest.mark.parametrize("milliseconds", [0, -15, 12, 16])
-def test_stamps_are_of_capture_and_colour_and_depth_need_not_be_captured_together(
-    walk: list[Moment], milliseconds: int
-) -> None:
+def test_stamps_are_of_capture_and_colour_and_depth_need_not_coincide(walk: list[Moment], milliseconds: int) -> None:
     before = time.time_ns()
     messages = script(walk, depth_late=timedelta(milliseconds=milliseconds))
     after = time.time_ns()

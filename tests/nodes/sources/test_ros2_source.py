@@ -96,9 +96,7 @@ def test_a_topic_becomes_pose_raw(make_launch: Callable[..., Launch], tmp_path: 
     assert source.status()["camera"].startswith("/skeletons, ")
 
 
-def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(
-    make_launch: Callable[..., Launch], clock: VirtualClock
-) -> None:
+def test_more_bodies_than_a_message_holds_are_refused_and_the_next_frame_comes(make_launch, clock: VirtualClock):
     crowd = from_pose_array(pose_array(22 * (MAX_BODIES + 1)), CANONICAL, "z")
     frames = Given(raw(1, walking(1)), crowd, raw(2, walking(2)))
     source = PoseInputNode(make_launch(transport__lossless="false"), clock, frames)

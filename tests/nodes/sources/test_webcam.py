@@ -352,9 +352,7 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path, clock: Virt
     ],
     ids=["uncalibrated", "a clock behind", "one name"],
 )
-def test_a_camera_that_is_not_merged_is_a_problem(
-    folder: Path, clock: VirtualClock, change: Callable[[PoseRaw], PoseRaw], cause: str, words: str
-) -> None:
+def test_a_camera_not_merged_is_a_problem(folder: Path, clock: VirtualClock, change, cause: str, words: str):
     with merging(folder, clock) as (source, frames, (left, right)):
         for index, views in enumerate(zip(filmed("left", range(0)), filmed("right", range(0)), strict=True), start=1):
             left.publish(POSE_RAW, views[0])

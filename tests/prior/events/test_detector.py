@@ -85,10 +85,8 @@ def message(index: int, *poses: Pose, sigma: float = 0.01, tracking: Tracking = 
     known = [np.where(np.isfinite(p).all(axis=1), JointState.SEEN, JointState.UNKNOWN) for p in poses]
     same = {"root_orientation": np.array([0.0, 0.0, 1.0, 0.0]), "sigma": np.full(22, sigma), "tracking": tracking}
     same |= {"covariance": np.eye(6) * sigma**2}
-    bodies = [
-        world_body(np.nan_to_num(p), id=k, root_position=p[0], state=known[k], **same) for k, p in enumerate(poses)
-    ]
-    return PoseWorld(START_NS + index * FRAME_NS, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), bodies)
+    made = [world_body(np.nan_to_num(p), id=k, root_position=p[0], state=known[k], **same) for k, p in enumerate(poses)]
+    return PoseWorld(START_NS + index * FRAME_NS, "world", "test", np.array([0.0, 0.0, 1.0, 0.0]), made)
 
 
 def changes(poses: Iterable[Pose], sigma: float = 0.01) -> list[tuple[int, EventKind, Hand, Phase]]:
@@ -146,9 +144,7 @@ def test_an_event_begins_alone_at_its_threshold_and_ends_at_the_laxer_one_when_c
     [(True, 0.0, True, 1.0), (True, 0.6, True, 1.0), (False, 0.0, True, 1.0), (True, 0.0, False, 1.0),
      (True, 0.0, True, 1.12), (True, 0.0, True, 0.9)],
 )  # fmt: skip
-def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits(
-    calibrated: bool, height: float, hips: bool, guess: float
-) -> None:
+def test_behind_a_counter_the_height_over_the_floor_says_who_sits(calibrated: bool, height: float, hips: bool, guess):
     # legs are guessed to stand, always; hips that are hidden too are known by the neck
     legs = [J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "ankle", "foot")]
     ankles = [J["left_ankle"], J["right_ankle"]]
@@ -176,7 +172,7 @@ def test_behind_a_counter_the_height_over_a_known_floor_says_who_stands_and_sits
 
 
 @pytest.mark.parametrize(
-    ("swing", "hertz", "waves"), [(0.5, 1.5, True), (0.25, 1.0, True), (0.16, 2.0, False), (1.0, 0.5, False)]
+    ("swing", "hertz", "waves"), [(0.5, 1.5, True), (0.25, 1, True), (0.16, 2, False), (1, 0.5, False)]
 )
 def test_a_hand_that_swings_from_side_to_side_far_and_quickly_waves(swing: float, hertz: float, waves: bool) -> None:
     swings = [raised(standing(), swing=swing * np.sin(2 * np.pi * hertz * k / 30)) for k in range(90)]
@@ -194,7 +190,7 @@ def test_who_lies_does_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(
-    ("speed", "wait_s", "fell"), [(1.25, 0.0, True), (1.15, 0.0, False), (2.0, 1.3, True), (2.0, 1.7, False)]
+    ("speed", "wait_s", "fell"), [(1.25, 0, True), (1.15, 0, False), (2, 1.3, True), (2, 1.7, False)]
 )
 def test_a_fall_is_faster_than_12_dm_s_within_two_seconds_before_lying(speed: float, wait_s: float, fell: bool) -> None:
     heights, neck = [1.5], standing()[J["neck"], 2] / (standing()[J["head"], 2] - standing()[J["left_ankle"], 2])
@@ -309,9 +305,7 @@ def test_a_stream_that_begins_anew_begins_with_nobody() -> None:
 
 @given(st.lists(st.floats(-2.0, 2.0) | st.just(float("nan")), max_size=60), st.floats(0.0, 0.5))
 @settings(max_examples=100, deadline=None)
-def test_a_trigger_begins_above_its_threshold_only_and_ends_below_the_other_only(
-    values: list[float], sigma: float
-) -> None:
+def test_a_trigger_begins_above_its_threshold_only_and_ends_below_the_other_only(values: list[float], sigma: float):
     trigger = Trigger(on=0.5, margin=0.4, hold_s=0.05, confidence=0.7)
     for index, value in enumerate(values):
         before = trigger.active
@@ -433,7 +427,7 @@ def test_a_wave_is_over_when_the_hand_is_down_though_it_comes_up_again() -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("near", -1.0), ("hold", 61.0), ("confidence", 0.4), ("confidence", 1.0), ("faces", 4.0)]
+    ("name", "value"), [("near", -1), ("hold", 61), ("confidence", 0.4), ("confidence", 1), ("faces", 4)]
 )
 def test_a_threshold_that_cannot_be_is_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):

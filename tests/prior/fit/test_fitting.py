@@ -71,9 +71,7 @@ def test_key_points_and_depth_find_the_motion_again(model: HumorNet, clips: Moti
     assert error(deep.joints, taken.truth) < min(0.1, error(flat.joints, taken.truth))
 
 
-def test_a_long_track_is_one_motion_and_done_windows_are_not_done_again(
-    model: HumorNet, truth: np.ndarray, tmp_path: Path, monkeypatch
-) -> None:
+def test_a_long_track_is_one_motion_and_windows_are_done_once(model: HumorNet, truth, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(windows, "FRAMES", 20)
     monkeypatch.setattr(windows, "OVERLAP", 5)
     seen = truth[:35] + 0.01 * np.random.default_rng(0).standard_normal(truth[:35].shape)

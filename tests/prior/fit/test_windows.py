@@ -141,9 +141,7 @@ def test_a_motion_model_that_contradicts_the_observations_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "kept"), [(50.0, 53.9, True), (50.0, 54.1, False), (1.0, 9.9, True), (1.0, 10.1, False)]
 )
-def test_the_last_stage_may_explain_a_little_less_or_anything_far_below_the_noise(
-    before: float, after: float, kept: bool
-) -> None:
+def test_the_last_stage_may_explain_a_little_less_or_all_below_the_noise(before: float, after: float, kept: bool):
     def of(nats: float) -> Motion:
         return cast(Motion, torch.full((200,), (nats / 100.0) ** 0.5))  # 200 residuals; 100 nats are their noise's
 

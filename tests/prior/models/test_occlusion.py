@@ -114,9 +114,7 @@ LEG = [J[f"left_{name}"] for name in ("knee", "ankle", "foot")]
 
 
 @pytest.mark.parametrize(("limb", "share"), [(ARM, 0.5), (LEG, 0.0)])
-def test_a_limb_never_seen_is_between_completion_standing_body_and_posture_and_goes_with_the_body(
-    limb: list[int], share: float
-) -> None:
+def test_a_limb_never_seen_is_between_completion_standing_body_and_posture(limb: list[int], share: float) -> None:
     truth, rng, joints = walking(), np.random.default_rng(0), OccludedJoints("default", 1)
     joints.weigher, posture = (asked := Asked()), LivePosture.load("default")
     unseen, sigma, off = np.zeros((1, 22)), np.full((1, 22), 0.005), []

@@ -69,9 +69,7 @@ points = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 
 
 @given(points, points, points, points)
-def test_the_gap_between_segments_is_the_least_distance(
-    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray
-) -> None:
+def test_the_gap_between_segments_is_the_least_distance(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray):
     gap, along = segment_gap(p, q, a, b)
     grid = np.linspace(0, 1, 81)
     on_first = p + grid[:, None] * (q - p)

@@ -36,10 +36,8 @@ def body(**fields: Any) -> CleanBody:
 
 def seen(last: BodyObservation | None = None, after_s: float = 0.0, **fields: Any) -> BodyObservation:
     """The observation of a body by a sensor at the world's origin."""
-    before = {1: last} if last else {}
-    return observe([body(**fields)], round((last.stamp_ns if last else 0) + after_s * 1e9), UNIT, np.zeros(3), before)[
-        0
-    ]
+    before, stamp_ns = ({1: last}, last.stamp_ns) if last else ({}, 0)
+    return observe([body(**fields)], round(stamp_ns + after_s * 1e9), UNIT, np.zeros(3), before)[0]
 
 
 def test_a_body_is_where_the_sensors_pose_puts_it() -> None:
@@ -208,9 +206,8 @@ def test_contacts_are_read_from_two_frames_above_the_ground_under_each_foot(monk
     np.testing.assert_array_equal(known, [[1, 1], [1, 1], [1, 1], [0, 0]])
     np.testing.assert_allclose(joints[:3, :, 7], np.tile([[0.0], [0.5], [0.0]], (1, 8)), atol=1e-5)
     # knees and hands are above the ground of the lower foot
-    raised = np.where(
-        np.isin(CONTACT_JOINTS, FEET), STANDING[list(CONTACT_JOINTS), 2], positions[list(CONTACT_JOINTS), 2]
-    )
+    joint = list(CONTACT_JOINTS)
+    raised = np.where(np.isin(joint, FEET), STANDING[joint, 2], positions[joint, 2])
     expected = np.clip(raised - REST_HEIGHT, -0.6, 0.6)
     np.testing.assert_allclose(0.1 * joints[:3, :, 6], np.tile(expected, (3, 1)), atol=1e-3)
     assert memory.state.tolist() == [2.0], "begun anew after a gap"

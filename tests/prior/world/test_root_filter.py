@@ -21,9 +21,7 @@ SOLES = np.array([0.07, 0.07, 0.022, 0.022])
 HIDDEN = np.inf
 
 
-def seen(
-    root: Any, dt: float = DT, *, sigma: float = 0.02, root_sigma: float | None = None, legs: float = 1.0
-) -> BodyObservation:
+def seen(root: Any, dt: float = DT, sigma: float = 0.02, root_sigma: float | None = None, legs=1.0) -> BodyObservation:
     """A body in the rest pose, of which a share of the legs is observed."""
     positions = REST_POSITIONS - REST_POSITIONS[0] + root
     observed = np.ones(22, dtype=bool)
@@ -103,9 +101,8 @@ def settled(sigma: float = 0.02) -> RootFilter:
 
 def places(ours: RootFilter, at: float, frames: int, sigma: float = 0.02) -> NDArray[np.float64]:
     """Where the root is estimated, along the axis along which it has jumped."""
-    states = [
-        ours.update(seen(np.array([0.0, at, 0.0]), sigma=sigma), STILL, SWINGS, Floor(True)) for _ in range(frames)
-    ]
+    now = seen(np.array([0.0, at, 0.0]), sigma=sigma)
+    states = [ours.update(now, STILL, SWINGS, Floor(True)) for _ in range(frames)]
     return np.array([state.position[1] for state in states])
 
 

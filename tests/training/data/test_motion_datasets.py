@@ -161,8 +161,6 @@ def test_dancers_and_actors_are_told_from_the_names_of_files(tmp_path: Path) -> 
         ),
     ],
 )
-def test_repeats_and_takes_of_unknown_speed_are_left_out_by_name(
-    tmp_path: Path, name: str, files: dict[str, str], expected: list[tuple[str, str]]
-) -> None:
+def test_repeats_and_takes_of_unknown_speed_are_left_out(tmp_path: Path, name: str, files: dict[str, str], expected):
     read = [part for s in DATA_SETS if s.name == name for part in s.read(unpack(tmp_path, files), ignore)]
     assert [(d.name, d.kind) for d in read if isinstance(d, Dropped)] == expected
