@@ -3,17 +3,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from steadypose.benchmarks.baselines import filters
+from steadypose.benchmarks.baselines import filters, kalman
 from steadypose.benchmarks.baselines.body import ConditionalGaussian, beside
 from steadypose.benchmarks.baselines.filters import BASELINES, FILTERS, OFFLINE, interpolate, one_euro
-from steadypose.benchmarks.baselines.kalman import (
-    bank,
-    fixed_lag,
-    noise_found,
-    process_noise,
-    transition,
-    whole_body_bank,
-)
+from steadypose.benchmarks.baselines.kalman import bank, fixed_lag, noise_found, process_noise, transition
 from steadypose.benchmarks.studies.hidden_joints import given_the_seen
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
@@ -138,7 +131,7 @@ def test_the_bank_is_true_to_what_is_clean_and_smooths_what_is_noisy_without_bei
 
 def test_the_bank_finds_the_noise_and_that_of_whole_bodies_refuses_a_choice_of_joints() -> None:
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 22, 3\) canonical joints"):
-        whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
+        kalman.whole_body_bank(np.zeros((5, 13, 3)), np.arange(5) / 30, 0)
     rng = np.random.default_rng(7)
     moving = 2.0 * STAMPS[:, None, None, None] * np.ones((1, 2, 5, 3))
     for sigma in (0.002, 0.05):

@@ -20,24 +20,7 @@ from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.results import Result
 from steadypose.benchmarks.scores import interval, position_error
 from steadypose.benchmarks.studies import kinect_methods, kinect_vicon
-from steadypose.benchmarks.studies.kinect_methods import (
-    KNOWN,
-    RIDGE,
-    SCORED,
-    TCN,
-    UNKNOWN,
-    Clip,
-    Kinect,
-    Method,
-    Scores,
-    Stated,
-    align,
-    deviation,
-    learn_offset,
-    move,
-    run_ours,
-    score,
-)
+from steadypose.benchmarks.studies.kinect_methods import KNOWN, RIDGE, TCN, UNKNOWN, Clip, Kinect, Method, Stated, align
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.settings import PriorSettings
@@ -62,7 +45,7 @@ def pair(subject: str, take: int, corrupted: str) -> KinectPair:
 
 def clip(subject: str, take: int, corrupted: str) -> Clip:
     one = pair(subject, take, corrupted)
-    scored = [J[name] for name in SCORED]
+    scored = [J[name] for name in kinect_methods.SCORED]
     raw = to_canonical(KINECT22, one.kinect)[0][:, scored]
     truth = np.nan_to_num(one.vicon[:, scored])
     return Clip(one.name, subject, one.kinect, raw, truth)
@@ -150,8 +133,8 @@ def test_each_clip_gets_its_own_frames_of_the_scored_joints(monkeypatch: pytest.
         anomaly=rng.uniform(size=frames), flagged=rng.uniform(size=frames) > 0.5,
     )  # fmt: skip
     monkeypatch.setattr(kinect_methods.product, "run", lambda *_: made)
-    positions, stated = run_ours(some, PriorSettings(), 4)
-    scored = [J[name] for name in SCORED]
+    positions, stated = kinect_methods.run_ours(some, PriorSettings(), 4)
+    scored = [J[name] for name in kinect_methods.SCORED]
     for number, (own, told, count) in enumerate(zip(positions, stated, (FRAMES, 12), strict=True)):
         np.testing.assert_array_equal(own, made.positions[:count, number, scored])
         np.testing.assert_array_equal(told.sigma, made.sigma[:count, number, scored])
@@ -210,7 +193,7 @@ def stated(one: Clip) -> Stated:
     return Stated(sigma, np.linspace(0, 1, shape[0]), np.arange(shape[0]) < 3)
 
 
-def left_out(scale: float) -> list[tuple[Scores, np.ndarray]]:
+def left_out(scale: float) -> list[tuple[kinect_methods.Scores, np.ndarray]]:
     """Each person's scores and errors with the offset of a third of the others' clips."""
     found = []
     for who in kinect_vicon.SUBJECTS:
@@ -219,9 +202,9 @@ def left_out(scale: float) -> list[tuple[Scores, np.ndarray]]:
         (known, seen), (wanted, own) = (
             ([one.centres for one in some], [scale * one.raw for one in some]) for some in (others, asked)
         )
-        offset, aligned = learn_offset(known, align(known, seen)), align(wanted, own)
-        errors = [position_error(move(a, offset), t) for a, t in zip(aligned, wanted, strict=True)]
-        found.append((score(wanted, aligned, offset), np.concatenate(errors)))
+        offset, aligned = kinect_methods.learn_offset(known, align(known, seen)), align(wanted, own)
+        errors = [position_error(kinect_methods.move(a, offset), t) for a, t in zip(aligned, wanted, strict=True)]
+        found.append((kinect_methods.score(wanted, aligned, offset), np.concatenate(errors)))
     return found
 
 
@@ -283,7 +266,7 @@ def test_what_is_stated_is_compared_with_each_persons_errors(result: Result) -> 
         errors = [error for _, error in left_out(SCALES[name, 4])]
         for number, (who, error) in enumerate(zip(kinect_vicon.SUBJECTS, errors, strict=True)):
             own = (np.concatenate(part) for part in zip(*told[2 * number : 2 * number + 2], strict=True))
-            expected = deviation(error, *own)
+            expected = kinect_methods.deviation(error, *own)
             assert record["deviation"][who] == expected
             row = next(row for row in result.tables[1].rows if row[0] == f"{who}, {says}")
             assert row[1] == f"{expected['rank_correlation']:.2f}"

@@ -4,13 +4,7 @@ import torch
 
 from steadypose.benchmarks.baselines import kinect_regression
 from steadypose.benchmarks.baselines.kalman import fixed_lag
-from steadypose.benchmarks.baselines.kinect_regression import (
-    _OTHER_SIDE,
-    Smoothed,
-    _mirrored,
-    ridge,
-    temporal_convolution,
-)
+from steadypose.benchmarks.baselines.kinect_regression import _OTHER_SIDE, Smoothed, _mirrored, ridge
 from steadypose.benchmarks.scores import position_error
 from steadypose.benchmarks.studies.kinect_methods import OTHER_SIDE, SCORED
 from steadypose.prior.body.kinematics import rigid_alignment
@@ -57,7 +51,7 @@ def test_both_regressions_learn_an_error_that_hangs_on_the_pose() -> None:
     before = gap(asked.answer, truth)
     assert gap(ridge(clips, truths, penalty=0.01)(asked), truth) < 0.17 * before
     assert gap(ridge(clips, truths, penalty=1e9)(asked), truth) > 0.5 * before
-    learned = temporal_convolution(clips, truths, OTHER_SIDE, ahead=4, steps=60, seed=0)
+    learned = kinect_regression.temporal_convolution(clips, truths, OTHER_SIDE, ahead=4, steps=60, seed=0)
     assert gap(learned(asked), truth) < 0.27 * before
 
 
@@ -92,7 +86,7 @@ def test_what_is_missing_leads_from_the_clip_to_the_truth_that_is_moved_to_it() 
 @pytest.mark.parametrize("ahead", [0, 4])
 def test_a_convolution_reads_twenty_four_frames_that_end_where_it_may_look(ahead: int) -> None:
     clips, truths = zip(*(lesson(seed) for seed in range(3)), strict=True)
-    learned = temporal_convolution(clips, truths, OTHER_SIDE, ahead, steps=2, seed=0)
+    learned = kinect_regression.temporal_convolution(clips, truths, OTHER_SIDE, ahead, steps=2, seed=0)
     clip = lesson(5, 70)[0]
     before = learned(clip)
     clip.inputs[40] += 1.0

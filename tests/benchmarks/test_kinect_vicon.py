@@ -12,18 +12,7 @@ from scipy.stats import spearmanr
 from steadypose.benchmarks.baselines.filters import Baseline, constant_velocity, gaussian_hampel, one_euro
 from steadypose.benchmarks.bench import Bench, Tuned
 from steadypose.benchmarks.studies import kinect_methods
-from steadypose.benchmarks.studies.kinect_methods import (
-    SCORED,
-    Clip,
-    Kinect,
-    Stated,
-    align,
-    best_without,
-    deviation,
-    learn_offset,
-    run_filter,
-    score,
-)
+from steadypose.benchmarks.studies.kinect_methods import SCORED, Clip, Kinect, align, deviation, run_filter, score
 from steadypose.prior.body.layouts import KINECT22, to_canonical
 from steadypose.prior.body.skeleton import J
 from steadypose.training.data.readers import KinectPair
@@ -57,7 +46,7 @@ def clip(seed: int, frames: int) -> Clip:
 def test_a_constant_offset_in_the_body_is_learned_on_one_subject_and_taken_from_another() -> None:
     train, validation = [clip(s, 40) for s in range(4)], [clip(s, 40) for s in range(10, 14)]
     known, asked = [c.centres for c in train], [c.centres for c in validation]
-    offset = learn_offset(known, align(known, [c.raw for c in train]))
+    offset = kinect_methods.learn_offset(known, align(known, [c.raw for c in train]))
     aligned = align(asked, [c.raw for c in validation])
     without = score(asked, aligned, np.zeros_like(offset))
     corrected = score(asked, aligned, offset)
@@ -134,8 +123,12 @@ def test_a_filter_is_chosen_by_the_others_figures() -> None:
         for d, of in ((0.5, (1.0, 9.0, 9.0)), (5.0, (9.0, 4.0, 8.0)))
     ]  # fmt: skip
     found = Tuned({"density": 0.5}, tried)
-    assert [best_without(s, found, baseline)["density"] for s in ("s01", "s02", "s03")] == [5.0, 0.5, 0.5]
-    assert best_without("s01", Tuned({}, []), baseline) == {}
+    assert [kinect_methods.best_without(s, found, baseline)["density"] for s in ("s01", "s02", "s03")] == [
+        5.0,
+        0.5,
+        0.5,
+    ]
+    assert kinect_methods.best_without("s01", Tuned({}, []), baseline) == {}
 
 
 def test_a_filter_of_whole_bodies_gets_all_joints_and_its_scored_ones_are_kept() -> None:
@@ -164,9 +157,9 @@ def test_what_is_the_same_for_all_is_run_once_and_each_clip_gets_its_own() -> No
     clips = [clip(n, 12)._replace(name=f"{n}") for n in range(3)]
     kinect, asked = Kinect(cast(Bench, None), Path("nowhere.npz"), clips, clips), []
 
-    def run(some: Sequence[Clip], stated: bool) -> tuple[list[np.ndarray], list[Stated] | None]:
+    def run(some: Sequence[Clip], stated: bool) -> tuple[list[np.ndarray], list[kinect_methods.Stated] | None]:
         asked.append(len(some))
-        told = [Stated(one.raw[..., 0], one.raw[:, 0, 0], one.raw[:, 0, 0] > 0) for one in some]
+        told = [kinect_methods.Stated(one.raw[..., 0], one.raw[:, 0, 0], one.raw[:, 0, 0] > 0) for one in some]
         return [one.raw for one in some], told if stated else None
 
     for stated in (True, False, True):

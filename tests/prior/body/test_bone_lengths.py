@@ -2,16 +2,8 @@ import numpy as np
 import pytest
 from tests.helpers.bodies import fk, random_pose, waving
 
-from steadypose.prior.body.bone_lengths import (
-    LENGTH_BIASES,
-    LIKE_SAMPLES,
-    LIMB_SPREAD,
-    STATURE_SPREAD,
-    TRUNK_PLACE_SPREAD,
-    TRUNK_SPREAD,
-    estimate_bones,
-    estimate_offsets,
-)
+from steadypose.prior.body import bone_lengths
+from steadypose.prior.body.bone_lengths import LIKE_SAMPLES, TRUNK_PLACE_SPREAD, estimate_bones, estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_pose
 from steadypose.prior.body.skeleton import COLLARS, HIPS, LIMB_ENDS, MIRROR, REST_OFFSETS, J
 
@@ -105,9 +97,11 @@ def test_lengths_are_the_posterior_of_a_stature_and_each_bones_own() -> None:
     bones = [joint for joint in range(1, 22) if joint <= MIRROR[joint]]
     rest = lengths(REST_OFFSETS)[bones]
     sides = np.array([1 if MIRROR[joint] == joint else 2 for joint in bones])
-    spread = np.array([LIMB_SPREAD if joint in LIMB_ENDS else TRUNK_SPREAD for joint in bones])
-    prior = np.diag(spread**2) + STATURE_SPREAD**2
-    bias, noise = LENGTH_BIASES * BIAS, np.sqrt(2.0) * NOISE
+    spread = np.array(
+        [bone_lengths.LIMB_SPREAD if joint in LIMB_ENDS else bone_lengths.TRUNK_SPREAD for joint in bones]
+    )
+    prior = np.diag(spread**2) + bone_lengths.STATURE_SPREAD**2
+    bias, noise = bone_lengths.LENGTH_BIASES * BIAS, np.sqrt(2.0) * NOISE
 
     def posterior(count: int) -> tuple[np.ndarray, np.ndarray]:
         error = (bias**2 / (1 + count / LIKE_SAMPLES) + noise**2 / (sides * count)) / rest**2

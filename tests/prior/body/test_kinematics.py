@@ -2,17 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from steadypose.prior.body import kinematics
 from steadypose.prior.body.inverse_kinematics import place_joints
-from steadypose.prior.body.kinematics import (
-    CONTACT_JOINTS,
-    LOAD_SPEED,
-    forward_kinematics,
-    from_rotation_vectors,
-    label_contacts,
-    quaternions,
-    rotation_matrix,
-    to_rotation_vectors,
-)
+from steadypose.prior.body.kinematics import CONTACT_JOINTS, LOAD_SPEED, label_contacts, quaternions, rotation_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_POSITIONS, J
 
 
@@ -32,7 +24,7 @@ def test_forward_kinematics_agrees_with_a_walk_down_the_tree() -> None:
     rotations = Rotation.random(6 * 22, rng=rng).as_matrix().reshape(2, 3, 22, 3, 3)
     offsets = rng.normal(size=(2, 3, 22, 3))
     root = rng.normal(size=(2, 3, 3))
-    got, orientations = forward_kinematics(rotations, offsets, root)
+    got, orientations = kinematics.forward_kinematics(rotations, offsets, root)
     for index in np.ndindex(2, 3):
         positions, world = naive_fk(rotations[index], offsets[index], root[index])
         assert np.allclose(got[index], positions)
@@ -75,6 +67,8 @@ def test_quaternions_are_scipys() -> None:
 def test_rotation_vectors_are_scipys() -> None:
     vectors = np.random.default_rng(0).normal(size=(40, 3))
     vectors[0], vectors[1] = 0.0, 1e-7
-    turned = from_rotation_vectors(vectors)
+    turned = kinematics.from_rotation_vectors(vectors)
     np.testing.assert_allclose(turned, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(to_rotation_vectors(turned), Rotation.from_matrix(turned).as_rotvec(), atol=1e-9)
+    np.testing.assert_allclose(
+        kinematics.to_rotation_vectors(turned), Rotation.from_matrix(turned).as_rotvec(), atol=1e-9
+    )

@@ -18,24 +18,15 @@ from tests.helpers.rendered_board import (
 )
 
 from steadypose.msgs.types import Pose
-from steadypose.prior.camera.calibration import (
-    Board,
-    CalibrationError,
-    Corners,
-    Intrinsics,
-    calibrate_lens,
-    camera_pose,
-    find_corners,
-    floor_pose,
-    points_of_depth,
-)
+from steadypose.prior.camera import calibration
+from steadypose.prior.camera.calibration import CalibrationError, calibrate_lens, camera_pose, find_corners, floor_pose
 from steadypose.prior.camera.gravity import GRAVITY, GravityEstimator, level_pose
 
 INNER = np.array([[x, y, 0.0] for y in range(1, BOARD.rows) for x in range(1, BOARD.columns)]) * BOARD.square
 EYE = look_at(np.array([-0.4, -1.0, 1.2]), np.array([0.2, 0.15, 0.0]))
 
 
-def project(pose: Pose, points: np.ndarray, lens: Intrinsics = LENS) -> np.ndarray:
+def project(pose: Pose, points: np.ndarray, lens: calibration.Intrinsics = LENS) -> np.ndarray:
     """Pixels (N, 2) of points (N, 3) in the world, by the definition of the messages' pose."""
     seen = (points - pose.position) @ Rotation.from_quat(pose.orientation).as_matrix()
     x, y = seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2]
@@ -47,8 +38,8 @@ def project(pose: Pose, points: np.ndarray, lens: Intrinsics = LENS) -> np.ndarr
     return bent * lens.focal + lens.centre
 
 
-def view(pose: Pose, rng: np.random.Generator, noise: float = 0.05) -> Corners:
-    return Corners(INNER, project(pose, INNER) + rng.normal(0.0, noise, (len(INNER), 2)))
+def view(pose: Pose, rng: np.random.Generator, noise: float = 0.05) -> calibration.Corners:
+    return calibration.Corners(INNER, project(pose, INNER) + rng.normal(0.0, noise, (len(INNER), 2)))
 
 
 @pytest.mark.slow
@@ -153,27 +144,27 @@ def test_a_view_without_a_floor_is_refused() -> None:
     with pytest.raises(CalibrationError, match="100 points"):
         floor_pose(np.full((500, 3), np.nan), np.array([0.0, -1.0, 0.0]))
     with pytest.raises(CalibrationError, match="got 0"):
-        floor_pose(points_of_depth(np.zeros((720, 1280), np.uint16), LENS), np.array([0.0, -1.0, 0.0]))
+        floor_pose(calibration.points_of_depth(np.zeros((720, 1280), np.uint16), LENS), np.array([0.0, -1.0, 0.0]))
     down = Rotation.from_quat(EYE.orientation).inv().apply([0.0, 0.0, -1.0])
     with pytest.raises(CalibrationError, match=r"a plane 1\.20 m above it: is the direction upwards"):
         floor_pose(depth_points(EYE, rng), down)
 
 
 def test_points_of_depth_lie_on_their_pixels_rays() -> None:
-    lens = Intrinsics((64, 48), (50.0, 52.0), (31.0, 24.5), LENS.distortion)
+    lens = calibration.Intrinsics((64, 48), (50.0, 52.0), (31.0, 24.5), LENS.distortion)
     depth = np.zeros((48, 64), np.uint16)
     depth[10, 20], depth[40, 5] = 1500, 2500
-    points = points_of_depth(depth, lens)
+    points = calibration.points_of_depth(depth, lens)
     assert points[:, 2] == pytest.approx([1.5, 2.5])
     assert project(Pose.identity(), points, lens) == pytest.approx(np.array([[20.0, 10.0], [5.0, 40.0]]), abs=1e-2)
     with pytest.raises(CalibrationError, match="64 x 48"):
-        points_of_depth(depth.T, lens)
+        calibration.points_of_depth(depth.T, lens)
 
 
 @pytest.mark.parametrize("board", [{"columns": 2}, {"square": 0.0}, {"square": float("nan")}])
 def test_a_board_that_cannot_be_is_refused(board: dict) -> None:
     with pytest.raises(CalibrationError, match="3 to 20"):
-        Board(**board)
+        calibration.Board(**board)
 
 
 SECOND_NS = 1_000_000_000

@@ -9,20 +9,8 @@ from torch import Tensor
 
 from steadypose.prior.body.kinematics import CONTACT_HEIGHT, CONTACT_JOINTS, REST_HEIGHT
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
-from steadypose.prior.fit.energy import (
-    Anchored,
-    Bones,
-    FirstState,
-    Ground,
-    Smooth,
-    Standing,
-    Term,
-    Transitions,
-    bisquare,
-    energy,
-    geman_mcclure,
-    huber,
-)
+from steadypose.prior.fit import energy
+from steadypose.prior.fit.energy import FirstState, Standing, Term, Transitions, bisquare, geman_mcclure, huber
 from steadypose.prior.fit.humor_network import HumorConfig, HumorNet
 from steadypose.prior.fit.humor_state import FEATURES
 from steadypose.prior.fit.motion import Motion, Variables
@@ -35,7 +23,7 @@ JOINTS, CONTACTS = 22, len(CONTACT_JOINTS)
 
 def nats(term: Term, **parts: Any) -> float:
     """The energy of one term, of a motion of which no more is given than the term may read."""
-    return float(energy(cast(Motion, SimpleNamespace(**parts)), [term]))
+    return float(energy.energy(cast(Motion, SimpleNamespace(**parts)), [term]))
 
 
 def zeros(*shape: int) -> Tensor:
@@ -101,17 +89,17 @@ def test_smooth_is_of_accelerations_in_metres_a_second_squared() -> None:
     t = torch.arange(FRAMES, dtype=torch.float64)[:, None, None] / 30.0
     joints = (0.5 * 8.0 * t**2 + 3.0 * t + 1.0) * torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     joints = joints.expand(FRAMES, JOINTS, 3)
-    assert nats(Smooth(sigma=4.0), joints=joints) == pytest.approx(0.5 * 4.0 * STEPS * JOINTS)
+    assert nats(energy.Smooth(sigma=4.0), joints=joints) == pytest.approx(0.5 * 4.0 * STEPS * JOINTS)
 
 
 def test_bones_cost_their_change() -> None:
     variables = SimpleNamespace(bones=zeros(JOINTS, 3) + 0.02)
-    assert nats(Bones(sigma=0.01), variables=variables) == pytest.approx(0.5 * 4.0 * JOINTS * 3)
+    assert nats(energy.Bones(sigma=0.01), variables=variables) == pytest.approx(0.5 * 4.0 * JOINTS * 3)
 
 
 def test_the_ground_costs_height_and_both_tilts() -> None:
     def cost(*ground: float) -> float:
-        return nats(Ground(0.1, 0.02, 0.05), variables=SimpleNamespace(ground=torch.tensor(ground)))
+        return nats(energy.Ground(0.1, 0.02, 0.05), variables=SimpleNamespace(ground=torch.tensor(ground)))
 
     assert cost(0.1, 0.0, 0.0) == 0.0
     assert cost(0.16, 0.0, 0.0) == pytest.approx(0.5 * 9.0, rel=1e-5)
@@ -157,7 +145,7 @@ def test_a_foot_under_the_ground_costs_in_every_frame() -> None:
 def test_a_window_is_anchored_where_the_one_before_ended() -> None:
     joints = zeros(FRAMES, JOINTS, 3)
     joints[2:] = 7.0
-    assert nats(Anchored(joints[:2] + 0.01, sigma=0.005), world_joints=joints) == pytest.approx(
+    assert nats(energy.Anchored(joints[:2] + 0.01, sigma=0.005), world_joints=joints) == pytest.approx(
         0.5 * 4.0 * 2 * JOINTS * 3
     )
 
@@ -241,7 +229,7 @@ def variables() -> Variables:
 
 def test_what_stands_is_weighed_by_contacts_that_it_does_not_move(model: HumorNet, variables: Variables) -> None:
     latents = variables.latents.clone().requires_grad_()
-    value = energy(Motion(model, replace(variables, latents=latents)), [Standing()])
+    value = energy.energy(Motion(model, replace(variables, latents=latents)), [Standing()])
     assert value > 0
     assert not value.requires_grad or torch.autograd.grad(value, latents, allow_unused=True)[0] is None
 

@@ -13,19 +13,10 @@ from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import REST_OFFSETS
+from steadypose.prior.fit import humor_state
 from steadypose.prior.fit.hmvae_network import Posterior
 from steadypose.prior.fit.humor_network import Gaussian, HumorConfig, HumorNet, roll_out, sample, transitions
-from steadypose.prior.fit.humor_state import (
-    CHANGE,
-    State,
-    canonical,
-    facing,
-    moved_by,
-    placed,
-    small_exp,
-    small_log,
-    states_of,
-)
+from steadypose.prior.fit.humor_state import CHANGE, State, canonical, facing, moved_by, placed, small_exp, states_of
 from steadypose.prior.fit.tensors import load_network
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.recipes.humor import Sequences, transition_loss
@@ -91,7 +82,9 @@ def test_rotation_vectors_are_scipys(seed: int) -> None:
     vector = np.random.default_rng(seed).uniform(-1.0, 1.0, (8, 3))  # well under half a turn
     matrix = small_exp(torch.from_numpy(vector))
     np.testing.assert_allclose(matrix.numpy(), Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
-    np.testing.assert_allclose(small_log(matrix).numpy(), Rotation.from_matrix(matrix.numpy()).as_rotvec(), atol=1e-5)
+    np.testing.assert_allclose(
+        humor_state.small_log(matrix).numpy(), Rotation.from_matrix(matrix.numpy()).as_rotvec(), atol=1e-5
+    )
 
 
 def test_a_step_is_that_of_plain_kinematics() -> None:

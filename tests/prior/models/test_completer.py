@@ -16,16 +16,9 @@ from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotatio
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import REST_OFFSETS, J
 from steadypose.prior.complete.body import frames_since_and_until
+from steadypose.prior.models import completer_features
 from steadypose.prior.models.completer import LiveCompleter
-from steadypose.prior.models.completer_features import (
-    FEATURES,
-    SHARE_FRAMES,
-    CompleterConfig,
-    correction_share,
-    growth,
-    read_window,
-    solved_rotations,
-)
+from steadypose.prior.models.completer_features import CompleterConfig, correction_share, read_window, solved_rotations
 from steadypose.prior.models.line import anchored, draw_line
 from steadypose.prior.models.weights import WeightsError
 from steadypose.training.data.dataset import MotionSet
@@ -78,7 +71,7 @@ def test_the_answer_turns_and_moves_with_the_body() -> None:
 def test_the_live_form_gives_what_the_network_gives() -> None:
     model = network()
     live = LiveCompleter(SMALL, arrays_of(model))
-    x = np.random.default_rng(0).standard_normal((3, 70, FEATURES)).astype(np.float32)
+    x = np.random.default_rng(0).standard_normal((3, 70, completer_features.FEATURES)).astype(np.float32)
     assert np.allclose(live.forward(x), model(torch.from_numpy(x)).detach().numpy(), atol=1e-4)
     positions, offsets = waving(30), REST_OFFSETS
     seen = np.stack([positions, positions])
@@ -131,7 +124,7 @@ def test_in_a_short_gap_little_is_taken_from_the_network() -> None:
     known = np.ones((2, 70, 1), dtype=bool)
     known[0, 10:15] = known[1, 5:] = False
     shares = correction_share(draw_line(known))
-    assert np.allclose(shares[0, 10:15], 6 / SHARE_FRAMES)
+    assert np.allclose(shares[0, 10:15], 6 / completer_features.SHARE_FRAMES)
     assert np.allclose(correction_share(draw_line(known), 3.0)[0, 10:15], 1.0)
     assert (shares[1, 5:] == 1.0).all()
 
@@ -216,7 +209,7 @@ def test_calibration_finds_the_errors_and_how_soon_they_grow(tmp_path: Path, mon
         """Every hidden joint is 0.1 m off along each axis at the distance of half the error, and 0.2 m far away."""
         since, until = frames_since_and_until(np.isfinite(seen[..., 0]))
         with np.errstate(divide="ignore"):
-            off = 0.2 * growth(1.0 / (1.0 / since + 1.0 / until), 5.0)
+            off = 0.2 * completer_features.growth(1.0 / (1.0 / since + 1.0 / until), 5.0)
         return Mock(positions=true[0] + off[..., None])
 
     motion = MotionSet.load(prepared(tmp_path / "m.npz"), "default", "val")

@@ -6,17 +6,9 @@ import torch
 from tests.prior.models.test_hgvae import SMALL, awake
 
 from steadypose.prior.body.skeleton import PARENTS, J
+from steadypose.prior.models.hgvae import live_completion
 from steadypose.prior.models.hgvae.config import SCALE, CompletionConfig
-from steadypose.prior.models.hgvae.live_completion import (
-    FIRST_LOG_VAR,
-    GROWTH,
-    HALF_CERTAIN_SIGMA,
-    LAG,
-    NEAR,
-    STILL,
-    Features,
-    completion_features,
-)
+from steadypose.prior.models.hgvae.live_completion import GROWTH, LAG, NEAR, STILL, Features, completion_features
 from steadypose.training.networks.graph import CompletionNet, certainty_of
 
 WRIST = J["left_wrist"]
@@ -82,7 +74,7 @@ def test_the_longer_ago_and_the_more_it_moves_the_less_the_line_counts() -> None
     assert all((more[1:] > still[1:]).all() for more in (moving, noisy, hanging))
     assert moving[-1] < 1
     line = (1e-4 + (STILL / SCALE) ** 2) * (np.arange(12) / LAG) ** GROWTH
-    np.testing.assert_allclose(still, line / (line + np.exp(FIRST_LOG_VAR)), rtol=1e-5)
+    np.testing.assert_allclose(still, line / (line + np.exp(live_completion.FIRST_LOG_VAR)), rtol=1e-5)
     never = line_variance(torch.full((1, 22, 12), -1.0), 0.0, 0.0)
     assert bool((network.fuse(written, never)[0] == 1).all())
 
@@ -94,7 +86,10 @@ def line_variance(apart: torch.Tensor, moved: float, noise: float) -> torch.Tens
 
 
 def test_a_guess_is_believed_by_how_good_it_is() -> None:
-    observed, log_var = torch.zeros(1, 66, 4), torch.full((1, 22, 4), 2 * np.log(HALF_CERTAIN_SIGMA / SCALE))
+    observed, log_var = (
+        torch.zeros(1, 66, 4),
+        torch.full((1, 22, 4), 2 * np.log(live_completion.HALF_CERTAIN_SIGMA / SCALE)),
+    )
     observed[:, :3] = 1
     log_var[:, 2] += np.log(3.0)
     found = certainty_of(observed, log_var)

@@ -8,16 +8,8 @@ from safetensors.torch import save_file
 from steadypose.benchmarks.baselines.kalman import fixed_lag
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
-from steadypose.prior.models.mixture.bank import (
-    DENSITIES,
-    EXPERTS,
-    MEASUREMENT_SIGMA,
-    MULTIPLE_MODEL,
-    SHARED,
-    Bank,
-    advance,
-    new_bank,
-)
+from steadypose.prior.models.mixture import bank as banks
+from steadypose.prior.models.mixture.bank import DENSITIES, EXPERTS, MEASUREMENT_SIGMA, Bank, advance, new_bank
 from steadypose.prior.models.mixture.features import FEATURES, PARENT, describe
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.mixture.tracks import HELD, MEMORY, MIN_SCALE, SETTLED, body_covariance
@@ -84,10 +76,10 @@ def test_experts_are_fixed_lag_smoothers_and_their_mean_by_predictions(delay: in
         each = np.stack([fixed_lag(*so_far, density, known_sigma)[t - delay] for density in DENSITIES], axis=1)
         np.testing.assert_allclose(experts[:, : len(DENSITIES)], each, atol=1e-6)
         noise = (likely(count, misfit, spread) * misfit / count).sum(axis=1)
-        shared = SHARED * white
+        shared = banks.SHARED * white
         weights = likely(count + shared, misfit + shared * np.exp(np.log(noise).mean()), spread)
         mean = (weights[..., None] * each).sum(axis=1)
-        np.testing.assert_allclose(experts[:, MULTIPLE_MODEL], mean, atol=1e-6)
+        np.testing.assert_allclose(experts[:, banks.MULTIPLE_MODEL], mean, atol=1e-6)
 
 
 def likely(count: Floats, misfit: Floats, spread: Floats) -> Floats:
@@ -112,7 +104,7 @@ def multiple_model(seen: Floats, covariance: Floats, delay: int = 4) -> tuple[Fl
         advance(bank, t, 1 / FPS, frame, np.ones((1, 22)), DENSITIES, MEASUREMENT_SIGMA, covariance)
         if t >= delay:
             experts, gap = described(bank, t + 1, delay)
-            found.append((experts[:, MULTIPLE_MODEL], gap))
+            found.append((experts[:, banks.MULTIPLE_MODEL], gap))
     estimates, gaps = zip(*found, strict=True)
     return np.array(estimates), np.array(gaps), bank
 

@@ -8,17 +8,8 @@ from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.kinematics import to_rotation_vectors
 from steadypose.prior.body.skeleton import HIPS, JOINTS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
-from steadypose.prior.models.posture import (
-    LEAST_SIGMA,
-    LENGTH_SIGMA,
-    LivePosture,
-    RootCovariance,
-    average_root,
-    on_bones,
-    rigid_covariance,
-    rigid_pelvis,
-    trunk_frame,
-)
+from steadypose.prior.models import posture as stage
+from steadypose.prior.models.posture import LENGTH_SIGMA, LivePosture, RootCovariance, on_bones, rigid_pelvis
 
 BODIES = 60
 POSED = [*HIPS, *SHOULDERS]
@@ -63,7 +54,7 @@ def test_the_misfit_is_minus_the_log_likelihood_up_to_a_constant(posture: LivePo
     middle = body[0, [*HIPS, *SHOULDERS]].mean(axis=0)
     both = known[1:] & known[PARENT[1:]]
     size = np.median(np.linalg.norm(body[0, 1:] - body[0, PARENT[1:]], axis=-1)[both] / LENGTHS[0, 1:][both])
-    local = (body - middle) @ trunk_frame(body[:1])[0] / size
+    local = (body - middle) @ stage.trunk_frame(body[:1])[0] / size
     rows = np.repeat(known, 3)
     covariance: Any = posture.covariance[np.ix_(rows, rows)] + 0.03**2 * np.eye(rows.sum())
     likely = multivariate_normal.logpdf(local.reshape(4, -1)[:, rows], posture.mean[rows], covariance)
@@ -118,7 +109,7 @@ def test_the_answer_turns_with_the_body_however_it_lies(posture: LivePosture, jo
 
 def _root(posture: LivePosture, joints: np.ndarray, sigma: float) -> np.ndarray:
     deviations = np.full((BODIES, 22), sigma)
-    return average_root(posture(joints, deviations, LENGTHS), joints, deviations, OFFSETS)
+    return stage.average_root(posture(joints, deviations, LENGTHS), joints, deviations, OFFSETS)
 
 
 def _angles(turned: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -150,7 +141,9 @@ def test_the_covariance_of_the_root_is_honest(posture: LivePosture, joints: np.n
 def test_a_perfect_root_is_said_to_be_as_sure_as_any(posture: LivePosture, joints: np.ndarray) -> None:
     root = _root(posture, joints, 0.0)
     covariance = RootCovariance()(joints, np.zeros((BODIES, 22)), root)
-    np.testing.assert_allclose(covariance, np.broadcast_to(LEAST_SIGMA**2 * np.eye(3), covariance.shape), atol=1e-6)
+    np.testing.assert_allclose(
+        covariance, np.broadcast_to(stage.LEAST_SIGMA**2 * np.eye(3), covariance.shape), atol=1e-6
+    )
 
 
 def test_a_rigid_pelvis_is_turned_as_its_bones_are() -> None:
@@ -166,5 +159,5 @@ def test_its_covariance_is_the_spread_of_noisy_pelvises() -> None:
     bones = np.broadcast_to(REST_OFFSETS, (count, 22, 3))
     noisy = rigid_pelvis(fk(turns) + rng.normal(0.0, 1.0, (count, 22, 3)) * sigma[..., None], bones)
     spread = np.cov(Rotation.from_matrix(turns[:, 0].swapaxes(-1, -2) @ noisy).as_rotvec().T)
-    stated = rigid_covariance(sigma[:1], bones[:1])[0]
+    stated = stage.rigid_covariance(sigma[:1], bones[:1])[0]
     np.testing.assert_allclose(stated, spread, atol=0.06 * np.trace(spread))

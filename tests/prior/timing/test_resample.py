@@ -5,17 +5,9 @@ from hypothesis import strategies as st
 from tests.helpers.bodies import waving
 
 from steadypose.prior.sim.noise import time_correlated
+from steadypose.prior.timing import resample
 from steadypose.prior.timing.kalman import INITIAL_SPEED, ConstantVelocityFilter
-from steadypose.prior.timing.resample import (
-    LOOK_AHEAD_NS,
-    MAX_GAP_NS,
-    PERIOD_NS,
-    RUNS,
-    DecimationFilter,
-    Frame,
-    Republished,
-    Resampler,
-)
+from steadypose.prior.timing.resample import LOOK_AHEAD_NS, PERIOD_NS, RUNS, DecimationFilter, Frame, Resampler
 
 SLOTS = 2
 
@@ -81,7 +73,7 @@ def test_a_joint_hidden_for_long_is_missing_in_between_and_a_short_gap_is_bridge
 
 def test_a_slow_camera_is_interpolated_between_its_frames() -> None:
     step = 2 * PERIOD_NS
-    assert step < MAX_GAP_NS
+    assert step < resample.MAX_GAP_NS
     frames = feed([k * step for k in range(10)])
     assert all(np.isfinite(p).all() for _, p, _ in frames)
     assert frames[3][1][0, 0, 0] == pytest.approx(3 * PERIOD_NS * 1e-9)
@@ -121,7 +113,7 @@ def test_at_the_end_no_grid_time_is_lost(hz: int) -> None:
 
 
 def dropped(frames: np.ndarray) -> list[bool]:
-    republished = Republished()
+    republished = resample.Republished()
     return [republished.update(frame[None]) for frame in frames]
 
 

@@ -12,18 +12,10 @@ from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, yaw_ma
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.models.contacts import Contacts, LiveContacts
 from steadypose.prior.models.root_velocity import LiveRootVelocity, NewestMotion
+from steadypose.prior.world import observe
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.networks import ContactNetwork, MotionMemory, VelocityNetwork, stance
-from steadypose.prior.world.observe import (
-    FEET,
-    FEET_OF_LEGS,
-    GUESSED_S,
-    LEG_CONTACTS,
-    BodyObservation,
-    LegMemory,
-    observe,
-    unit_quaternion,
-)
+from steadypose.prior.world.observe import FEET, GUESSED_S, BodyObservation, LegMemory, unit_quaternion
 
 STANDING = REST_POSITIONS - [0.0, 0.0, REST_POSITIONS[:, 2].min() - 0.022]
 UNIT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -37,7 +29,7 @@ def body(**fields: Any) -> CleanBody:
 def seen(last: BodyObservation | None = None, after_s: float = 0.0, **fields: Any) -> BodyObservation:
     """The observation of a body by a sensor at the world's origin."""
     before, stamp_ns = ({1: last}, last.stamp_ns) if last else ({}, 0)
-    return observe([body(**fields)], round(stamp_ns + after_s * 1e9), UNIT, np.zeros(3), before)[0]
+    return observe.observe([body(**fields)], round(stamp_ns + after_s * 1e9), UNIT, np.zeros(3), before)[0]
 
 
 def test_a_body_is_where_the_sensors_pose_puts_it() -> None:
@@ -45,7 +37,7 @@ def test_a_body_is_where_the_sensors_pose_puts_it() -> None:
     own = Rotation.from_rotvec([0.3, -0.1, 0.7])
     rotations = np.tile(UNIT, (22, 1))
     rotations[0] = -3.0 * own.as_quat()  # of any length and sign
-    (now,) = observe([body(rotations=rotations)], 5, turn.as_quat(), at, {})
+    (now,) = observe.observe([body(rotations=rotations)], 5, turn.as_quat(), at, {})
     np.testing.assert_allclose(now.positions, turn.apply(STANDING) + at, atol=1e-6)
     np.testing.assert_allclose(Rotation.from_quat(now.orientation).as_matrix(), (turn * own).as_matrix(), atol=1e-6)
     left = (turn * own).apply([0.0, 1.0, 0.0])
@@ -53,7 +45,7 @@ def test_a_body_is_where_the_sensors_pose_puts_it() -> None:
     assert (now.dt, now.after_gap) == (0.0, True)
     np.testing.assert_array_equal(now.feet, now.positions[list(FEET)])
     np.testing.assert_allclose(now.soles, now.feet - np.outer([0.07, 0.07, 0.022, 0.022], [0.0, 0.0, 1.0]), atol=1e-6)
-    assert observe([], 5, UNIT, at, {}) == []
+    assert observe.observe([], 5, UNIT, at, {}) == []
 
 
 def test_a_root_without_a_rotation_keeps_its_last() -> None:
@@ -231,7 +223,7 @@ LEGS = set(CONTACTS[:6])
 
 
 def test_feet_are_where_they_are_said_to_be() -> None:
-    assert [J[name] for name in CONTACTS[LEG_CONTACTS][FEET_OF_LEGS]] == list(FEET)
+    assert [J[name] for name in CONTACTS[observe.LEG_CONTACTS][observe.FEET_OF_LEGS]] == list(FEET)
     assert {name for name in CONTACTS if "wrist" not in name} == LEGS
 
 

@@ -7,14 +7,15 @@ import pytest
 from tests.helpers.bvh_writer import write_bvh
 from tests.helpers.motion_files import AMC, ASF
 from tests.prior.body.test_rigs import FAMILIES
+from tests.training.data.test_motion_plug_in_gait import BENDS, HIP, STILL, recording
 
-from steadypose.prior.body.layouts import CANONICAL
+from steadypose.prior.body.layouts import CANONICAL, KINECT22
 from steadypose.prior.body.skeleton import JOINTS, J
 from steadypose.prior.mocap.bvh import CMU_BVH
 from steadypose.prior.mocap.clip import Clip, MotionError, person_of
 from steadypose.training.data.cmu import CMU_AMC
 from steadypose.training.data.datasets import DATA_SETS, REPEATS
-from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, members
+from steadypose.training.data.readers import Dropped, amc_motions, bvh_motion, load_pairs, members
 
 
 def idle_bvh(frames: int = 60, fps: float = 24.0) -> str:
@@ -164,3 +165,42 @@ def test_dancers_and_actors_are_told_from_the_names_of_files(tmp_path: Path) -> 
 def test_repeats_and_takes_of_unknown_speed_are_left_out(tmp_path: Path, name: str, files: dict[str, str], expected):
     read = [part for s in DATA_SETS if s.name == name for part in s.read(unpack(tmp_path, files), ignore)]
     assert [(d.name, d.kind) for d in read if isinstance(d, Dropped)] == expected
+
+
+MARKERS = recording(BENDS, STILL, np.zeros(3))
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    names = sorted(MARKERS)
+    markers = np.stack([MARKERS[n] for n in names], axis=1)
+    counts = np.round(markers * 1e4).astype(np.int16)
+    counts[5, names.index("LWRA")] = -32768
+    kinect = np.zeros((len(counts), 22, 3), dtype=np.int16)
+    kinect[:, KINECT22.joints.index("Waist")] = [1000, 9000, -25000]  # y up, 2.5 m in front, looking along -z
+    arrays = {}
+    for name in ("m02_s01_e01", "m01_s01_e01_inc", "m01_s07_e01"):
+        arrays[f"{name}/kinect"], arrays[f"{name}/vicon_markers"] = kinect, counts
+    path = tmp_path / "ui_prmd.npz"
+    np.savez(path, fps=30.0, vicon_names=np.array(names), kinect_names=np.array(KINECT22.joints), **arrays)
+    return path
+
+
+def test_pairs_are_metric_z_up_and_in_order(archive: Path) -> None:
+    pairs = load_pairs(archive, ["s07", "s01"])
+    assert [p.name for p in pairs] == ["m01_s01_e01_inc", "m02_s01_e01", "m01_s07_e01"]
+    pair = pairs[1]
+    assert (pair.subject, pair.movement, pair.fps) == ("s01", "m02", 30.0)
+    np.testing.assert_allclose(pair.kinect[0, KINECT22.joints.index("Waist")], [0.1, 2.5, 0.9])
+    np.testing.assert_allclose(pair.vicon[0, J["left_hip"]], HIP, atol=2e-4)
+    lost = np.argwhere(np.isnan(pair.vicon).any(axis=-1))
+    assert [(int(t), JOINTS[j]) for t, j in lost] == [(5, "left_wrist")]
+
+
+def test_only_the_subjects_asked_for_are_read_and_another_npz_is_refused(archive: Path) -> None:
+    assert {p.subject for p in load_pairs(archive, ["s07"])} == {"s07"}
+    with pytest.raises(MotionError, match="no recordings of s09"):
+        load_pairs(archive, ["s07", "s09"])
+    np.savez(archive, a=1)
+    with pytest.raises(MotionError, match="vicon_names"):
+        load_pairs(archive, ["s01"])

@@ -20,18 +20,10 @@ from steadypose.prior.body.layouts import CANONICAL
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.mocap.clip import Clip, MotionError
 from steadypose.prior.timing.rate import FPS
+from steadypose.training.data import prepare as preparing
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.datasets import SPLITS
-from steadypose.training.data.prepare import (
-    Prepared,
-    fill_gaps,
-    find_faults,
-    floor_height,
-    prepare_clip,
-    resample,
-    stays_on_floor,
-    write_prepared,
-)
+from steadypose.training.data.prepare import Prepared, find_faults, prepare_clip, stays_on_floor, write_prepared
 from steadypose.training.data.readers import Dropped
 
 Array = NDArray[np.float64]
@@ -53,7 +45,7 @@ def test_downsampling_keeps_slow_motion_in_time_and_takes_out_what_would_alias()
     slow = 0.3 * np.sin(2 * np.pi * 2 * time)
     # At 30 Hz, 28 Hz would come out as 2 Hz.
     fast = 0.1 * np.sin(2 * np.pi * 28 * time)
-    out = resample(np.stack([slow, fast], axis=-1)[:, None, :].repeat(2, axis=-1)[..., :3], 120.0)
+    out = preparing.resample(np.stack([slow, fast], axis=-1)[:, None, :].repeat(2, axis=-1)[..., :3], 120.0)
     assert len(out) == 120
     inner = slice(15, -15)
     np.testing.assert_allclose(out[inner, 0, 0], 0.3 * np.sin(2 * np.pi * 2 * np.arange(120) / 30)[inner], atol=2e-3)
@@ -63,7 +55,7 @@ def test_downsampling_keeps_slow_motion_in_time_and_takes_out_what_would_alias()
 @given(fps=st.sampled_from([24.0, 25.0, 50.0, 59.94, 60.0, 100.0, 120.0]), frames=st.integers(40, 200))
 def test_resampling_is_by_time(fps: float, frames: int) -> None:
     time = np.arange(frames) / fps
-    out = resample((time[:, None, None] * [1.0, -2.0, 0.5])[:, :, :], fps)
+    out = preparing.resample((time[:, None, None] * [1.0, -2.0, 0.5])[:, :, :], fps)
     at = np.arange(len(out)) / FPS
     assert time[-1] - 1 / FPS < at[-1] <= time[-1] + 1e-6
     np.testing.assert_allclose(out[:, 0], at[:, None] * [1.0, -2.0, 0.5], atol=2e-3)
@@ -74,7 +66,7 @@ def test_only_short_gaps_between_observations_are_filled(start: int, length: int
     line = np.arange(31)[:, None, None] * np.array([0.1, 0.2, -0.1]) + np.zeros((1, 2, 1))
     holed = line.copy()
     holed[start : start + length, 1] = np.nan
-    filled = fill_gaps(holed, FPS)
+    filled = preparing.fill_gaps(holed, FPS)
     inside = start > 0 and start + length < 31 and length <= 6  # 0.2 s
     assert np.isfinite(filled[:, 1]).all() == inside
     np.testing.assert_array_equal(filled[:, 0], line[:, 0])
@@ -88,12 +80,12 @@ def test_the_floor_is_where_toes_rest_or_under_the_lower_toe(height: float) -> N
     # One foot lifted for a while, and one bad frame below the floor.
     body[30:60, J["left_foot"], 2] += 0.3
     body[70, J["right_foot"], 2] -= 0.2
-    assert floor_height(body) == pytest.approx(height, abs=0.002)
+    assert preparing.floor_height(body) == pytest.approx(height, abs=0.002)
     flying = standing(60, height)
     flying[:, :, 0] += 3.0 * np.arange(60)[:, None] / FPS
     flying[::2, :, 2] += 0.1
     flying[:, J["left_foot"], 2] += 0.3
-    assert floor_height(flying) == pytest.approx(height, abs=0.002)
+    assert preparing.floor_height(flying) == pytest.approx(height, abs=0.002)
 
 
 def test_standing_on_something_is_not_staying_on_the_floor() -> None:

@@ -3,15 +3,8 @@ import pytest
 from tests.helpers.bodies import waving
 
 from steadypose.prior.body.skeleton import MIRROR, PARENTS, J
-from steadypose.training.data.corruption import (
-    add_noise,
-    draw_bias_sigma,
-    hide_joints,
-    occlude,
-    vary_builds,
-    with_faults,
-    with_sensor_error,
-)
+from steadypose.training.data import corruption
+from steadypose.training.data.corruption import add_noise, occlude, vary_builds, with_faults, with_sensor_error
 from steadypose.training.recipes.hgvae_faults import FAULTS
 
 WINDOWS = np.stack([waving(50, speed=1.0 + 0.05 * k) for k in range(40)])
@@ -21,11 +14,11 @@ def test_the_truth_is_left_alone() -> None:
     rng, kept = np.random.default_rng(0), WINDOWS.copy()
     for spoilt in (
         occlude(WINDOWS, rng),
-        add_noise(WINDOWS, rng, draw_bias_sigma(40, rng)),
+        add_noise(WINDOWS, rng, corruption.draw_bias_sigma(40, rng)),
         vary_builds(WINDOWS, 0.05, 0.2, rng),
         with_faults(WINDOWS, FAULTS, 1.0, rng),
         with_sensor_error(WINDOWS, 0.01, rng),
-        hide_joints(WINDOWS, 3, rng),
+        corruption.hide_joints(WINDOWS, 3, rng),
     ):
         assert spoilt.shape == WINDOWS.shape
         assert not np.array_equal(spoilt, kept, equal_nan=True)
