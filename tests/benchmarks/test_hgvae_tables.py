@@ -34,9 +34,8 @@ def test_a_fault_changes_windows_and_leaves_the_clean_ones_alone(name: str) -> N
 
 def test_a_joint_counts_as_frozen_only_where_it_would_have_moved_and_left_for_right_is_the_other_sides() -> None:
     still = np.repeat(waving(1)[None], 50, axis=1)
-    corrupted, holds = FAULTS["a joint frozen"](
-        np.concatenate([still, waving(50, speed=3)[None]]), np.random.default_rng(0)
-    )
+    both = np.concatenate([still, waving(50, speed=3)[None]])
+    corrupted, holds = FAULTS["a joint frozen"](both, np.random.default_rng(0))
     assert holds.tolist() == [False, True]
     stopped = np.ptp(corrupted[1, BEGINS - 1 :], axis=0).max(axis=-1) == 0
     assert stopped.sum() == 1

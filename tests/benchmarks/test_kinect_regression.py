@@ -39,9 +39,8 @@ def test_a_mirror_exchanges_sides_and_twice_is_nothing() -> None:
     poses = torch.randn(4, 5, 66)
     once = _mirrored(poses, _OTHER_SIDE)
     left, right = KINECT22.joints.index("LHand"), KINECT22.joints.index("RHand")
-    torch.testing.assert_close(
-        once[..., 3 * left : 3 * left + 3], poses[..., 3 * right : 3 * right + 3] * torch.tensor([1.0, -1.0, 1.0])
-    )
+    other = poses[..., 3 * right : 3 * right + 3] * torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(once[..., 3 * left : 3 * left + 3], other)
     torch.testing.assert_close(_mirrored(once, _OTHER_SIDE), poses)
 
 

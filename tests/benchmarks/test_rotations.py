@@ -39,9 +39,8 @@ def test_heading_tilt_direction_and_twist_are_told_apart() -> None:
 
 def test_the_turn_beyond_is_that_of_noise() -> None:
     truth = np.broadcast_to(np.eye(3), (FRAMES, CLIPS, len(SCORED), 3, 3))
-    found = score(
-        _turns(np.random.default_rng(1), np.radians(1.0)), truth, np.repeat(waving(FRAMES)[:, None], CLIPS, 1)
-    )
+    turns, bodies = _turns(np.random.default_rng(1), np.radians(1.0)), np.repeat(waving(FRAMES)[:, None], CLIPS, 1)
+    found = score(turns, truth, bodies)
     assert abs(found["turn beyond"] - np.sqrt(2) * np.sqrt(8 / np.pi)) < 0.1
 
 

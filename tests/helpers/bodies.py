@@ -44,9 +44,8 @@ def waving(frames: int, scale: float = 1.0, speed: float = 1.0) -> np.ndarray:
         vectors[:, J[f"{side}_hip"], 1] = -0.4 - 0.2 * np.sin(t)
         vectors[:, J[f"{side}_knee"], 1] = 0.8 + 0.4 * np.sin(t)
     rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, 22, 3, 3)
-    positions = (
-        fk(rotations, REST_OFFSETS * scale) + np.stack([0.1 * np.sin(t), 0.1 * np.cos(t), 0 * t], axis=-1)[:, None]
-    )
+    way = np.stack([0.1 * np.sin(t), 0.1 * np.cos(t), 0 * t], axis=-1)
+    positions = fk(rotations, REST_OFFSETS * scale) + way[:, None]
     return positions - [0.0, 0.0, positions[..., 2].min() - 0.02]
 
 

@@ -81,16 +81,14 @@ def world(stamp_ns: int = 0) -> PoseWorld:
 
 
 def events(stamp_ns: int = 0) -> PoseEvents:
-    event = types.Event(
-        7, types.EventKind.POINTS, types.Phase.BEGINS, types.Hand.LEFT, 0.9, np.array([1, 0, 0]), stamp_ns
-    )
+    kind, phase, hand = types.EventKind.POINTS, types.Phase.BEGINS, types.Hand.LEFT
+    event = types.Event(7, kind, phase, hand, 0.9, np.array([1, 0, 0]), stamp_ns)
     return PoseEvents(stamp_ns, "world", "test", [event])
 
 
 def diagnostics(stamp_ns: int = 0) -> Diagnostics:
-    return Diagnostics(
-        stamp_ns, "prior", types.Level.WARN, "3 dropped or refused", {"rate": "30.0", "refused.nan": "3"}
-    )
+    values = {"rate": "30.0", "refused.nan": "3"}
+    return Diagnostics(stamp_ns, "prior", types.Level.WARN, "3 dropped or refused", values)
 
 
 EXAMPLES = {

@@ -10,9 +10,7 @@ from steadypose.prior.body.kinematics import quaternions
 from steadypose.prior.body.skeleton import REST_OFFSETS
 
 
-def write_motion(
-    path: Path, clips: Sequence[np.ndarray], split: Sequence[str], flat: Sequence[bool] | None = None
-) -> Path:
+def write_motion(path: Path, clips: Sequence[np.ndarray], split: Sequence[str], flat: Sequence[bool] = ()) -> Path:
     """Clips (T, 22, 3) metres, z up, of the rest skeleton; returns ``path``."""
     positions = np.concatenate(clips).astype(np.float32)
     same = {"set": "default", "subject": "somebody", "source": "synthetic"}
@@ -24,7 +22,7 @@ def write_motion(
         contacts=np.zeros((len(positions), 8), dtype=bool),
         clip_start=np.cumsum([0, *map(len, clips)]),
         split=np.array(split),
-        flat=np.ones(len(clips), dtype=bool) if flat is None else np.array(flat),
+        flat=np.array(flat or [True] * len(clips)),
         **{name: np.array([value] * len(clips)) for name, value in same.items()},  # type: ignore[arg-type]
     )
     return path

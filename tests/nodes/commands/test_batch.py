@@ -153,9 +153,8 @@ def test_nothing_is_replaced_that_was_not_made_here(tmp_path: Path, here: list[J
     (out / "manifest.jsonl").write_text("")
     before[out / "manifest.jsonl"] = ""
     assert clean(source, out) == 1
-    assert [line["error"].partition(":")[2] for line in lines(out)] == [
-        " expected a new path, or --force to replace it"
-    ] * 2
+    errors = [line["error"].partition(":")[2] for line in lines(out)]
+    assert errors == [" expected a new path, or --force to replace it"] * 2
     assert (out / "a" / "thesis.txt").read_text() == "years of work"
     assert (out / "b.npz").read_text() == "mine"
     for path in (out / "a", out / "b.npz"):

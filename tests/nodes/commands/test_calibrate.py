@@ -154,9 +154,8 @@ def test_the_floor_in_depth_tells_height_and_tilt_and_the_launch_file_stays_whol
 
 def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
     half = np.sqrt(0.5)
-    launch = make_launch(
-        input__calibration__position="[1.0, 2.0, 1.5]", input__calibration__orientation=f"[{-half}, 0.0, 0.0, {half}]"
-    )
+    told = {"position": "[1.0, 2.0, 1.5]", "orientation": f"[{-half}, 0.0, 0.0, {half}]"}
+    launch = make_launch({f"input.calibration.{key}": value for key, value in told.items()})
     node = PoseInputNode(launch, clock, RecordingSource(bundled("sim_data", "idle")))
     message = raw(0, walking(0))
     message.calibrated = False

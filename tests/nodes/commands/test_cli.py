@@ -140,7 +140,7 @@ for missing, (_, arguments) in {lacking}.items():
 
 
 @pytest.mark.parametrize(
-    "command", [*([name] for name in COMMANDS if name != "node"), ["calibrate", "floor"], ["calibrate", "board"]]
+    "command", [*([it] for it in COMMANDS if it != "node"), ["calibrate", "floor"], ["calibrate", "board"]]
 )
 def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -151,9 +151,8 @@ def test_help_fits_80_columns_and_breaks_between_words(command: list[str], monke
     words = {word for line in lines for word in line.split()}
     assert not any("{None" in word for word in words)
     assert "None)" not in words, "no default beside the one that is described"
-    assert not {"STR", "[STR]", "PATH"} & {line.split()[0] for line in lines if line[:2] == "  " and line.strip()}, (
-        "a name says more"
-    )
+    first = {line.split()[0] for line in lines if line[:2] == "  " and line.strip()}
+    assert not {"STR", "[STR]", "PATH"} & first, "a name says more"
     text = lines[lines.index("") :]
     for line, after in pairwise(text):
         if line[:1].strip() and after[:1].strip():

@@ -430,9 +430,8 @@ def test_what_is_garbled_or_lacks_keys_is_reported_with_the_address(make_launch,
 
 
 def test_counts_of_a_client_that_came_back_under_another_name_stay(make_launch: Callable[..., Launch]) -> None:
-    node = TrajectoryNode(
-        make_launch(nodes='["trajectory"]', server__clients='["tcp://127.0.0.1:1"]', transport__lossless="false")
-    )
+    clients = '["tcp://127.0.0.1:1"]'
+    node = TrajectoryNode(make_launch(nodes='["trajectory"]', server__clients=clients, transport__lossless="false"))
     for name in ("door", "desk", "hall"):
         node.handle(POSE_CLEAN, dataclasses.replace(clean(), source=name, sensor_pose=Pose(np.zeros(3), np.zeros(4))))
     assert node.status()["refused.sensor_pose_invalid"] == "3"

@@ -177,9 +177,8 @@ def hostile(tmp_path: Path) -> Path:
     where = tmp_path / "hostile"
     where.mkdir()
     for name in HOSTILE.split():
-        (where / f"{name}.py").write_text(
-            f"open({str(tmp_path / 'was run')!r}, 'a').write({name!r})\nraise SystemExit(3)\n"
-        )
+        code = f"open({str(tmp_path / 'was run')!r}, 'a').write({name!r})\nraise SystemExit(3)\n"
+        (where / f"{name}.py").write_text(code)
     return where
 
 

@@ -80,9 +80,7 @@ def read(path: Path, text: str) -> Launch:
 
 def test_a_node_of_another_package_is_one_of_the_graph(package: Any, tmp_path: Path) -> None:
     package.ROBOT = NodeDeclaration("acme:RobotNode", subscribes={"trajectory": (POSE_WORLD,)}, section="robot")
-    text = (
-        'nodes = ["pose_input", "prior", "trajectory", "robot"]\nplugins = {robot = "acme:ROBOT"}\n[robot]\nspeed = 2'
-    )
+    text = 'nodes = ["pose_input", "trajectory", "robot"]\nplugins = {robot = "acme:ROBOT"}\n[robot]\nspeed = 2'
     launch = read(tmp_path / "a.toml", text)
     assert launch.table("robot") == {"speed": 2}
     assert launch.reliable_subscribers("trajectory") == {"robot"}

@@ -18,7 +18,7 @@ from steadypose.nodes.commands.output import clean_recording
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_coco, from_mediapipe, from_zed, pinhole
 from steadypose.nodes.sources.recording import CsvSource
 from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, SKELETONS, ZED38, Skeleton, to_canonical
-from steadypose.prior.body.skeleton import JOINTS
+from steadypose.prior.body.skeleton import J
 
 STAMP_NS = 1_700_000_000_123_456_789
 STAMP = Made(sec=1_700_000_000, nanosec=123_456_789)
@@ -36,10 +36,8 @@ def standing(skeleton: Skeleton) -> np.ndarray:
 def upright(frame: PoseRaw) -> None:
     """The head is over the pelvis, and the pelvis over the feet, in the world as the message has it."""
     joints, _ = to_canonical(SKELETONS[frame.skeleton], frame.bodies[0].positions)
-    world = dict(
-        zip(JOINTS, Rotation.from_quat(frame.sensor_pose.orientation).apply(np.nan_to_num(joints)), strict=True)
-    )
-    assert world["neck"][2] > world["pelvis"][2] + 0.3 > world["left_ankle"][2] + 0.6
+    heights = Rotation.from_quat(frame.sensor_pose.orientation).apply(np.nan_to_num(joints))[:, 2]
+    assert heights[J["neck"]] > heights[J["pelvis"]] + 0.3 > heights[J["left_ankle"]] + 0.6
 
 
 def travels(frame: PoseRaw) -> None:
@@ -156,11 +154,7 @@ def test_coco_detections_are_lifted_by_depth() -> None:
 
 
 DOCS = Path(__file__).parents[3] / "docs"
-BLOCKS = dict(
-    re.findall(
-        r"^<!-- file: (\S+) -->\n```\w+\n(.*?)^```$", (DOCS / "sources.md").read_text(), re.MULTILINE | re.DOTALL
-    )
-)
+BLOCKS = dict(re.findall(r"(?ms)^<!-- file: (\S+) -->\n```\w+\n(.*?)^```$", (DOCS / "sources.md").read_text()))
 SOON_S = 30.0
 
 # the reader's own detector and depth camera

@@ -62,9 +62,8 @@ def test_people_are_lifted_where_they_stand(walk: list[Moment]) -> None:
         assert [body.id for body in frame.bodies] == [0, 1]
         for body, joints in zip(frame.bodies, truth.joints, strict=True):
             seen = body.confidence > 0
-            np.testing.assert_allclose(
-                CAMERA.project(body.positions[seen].astype(float)), CAMERA.project(joints[seen]), atol=0.6
-            )
+            found = CAMERA.project(body.positions[seen].astype(float))
+            np.testing.assert_allclose(found, CAMERA.project(joints[seen]), atol=0.6)
             error = np.linalg.norm(body.positions - joints, axis=-1)[BODY]
             assert np.isfinite(error).sum() >= 8
             assert np.nanmedian(error) < 0.04
@@ -126,9 +125,8 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     monkeypatch.setattr(oak_device, "QUEUE", 1000)  # these frames come faster than any camera's
     scene = [moment(frame) for frame in range(24)]
     launch = make_launch(input__source="oak")
-    source = CameraSource(
-        CONTEXT.clock, lambda: opener(lambda _: script(scene))(launch.settings(InputSettings).oak, CONTEXT.clock)
-    )
+    opens, settings = opener(lambda _: script(scene)), launch.settings(InputSettings).oak
+    source = CameraSource(CONTEXT.clock, lambda: opens(settings, CONTEXT.clock))
     nodes = [PoseInputNode(launch, Clock(), source), PriorNode(launch), TrajectoryNode(launch)]
     worlds: list[PoseWorld] = []
     with Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD) as subscriber, running(*nodes):
@@ -275,9 +273,8 @@ def test_the_image_after_those_in_which_the_camera_settles() -> None:
             ):
                 message.setTimestamp(start + index * oak_device.SYNC_THRESHOLD * 2)
                 player.script.append((name, message))
-        still = capture(
-            pipeline, player.outputs["colour"], player.outputs["depth"], (player.outputs["imu"], np.eye(3)), settle=1
-        )
+        out = player.outputs
+        still = capture(pipeline, out["colour"], out["depth"], (out["imu"], np.eye(3)), settle=1)
     assert still.colour[0, 0].tolist() == [101, 0, 10]
     np.testing.assert_array_equal(still.depth, scene.depth)
     np.testing.assert_allclose(still.intrinsics, CAMERA.intrinsics)

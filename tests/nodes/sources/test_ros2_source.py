@@ -181,7 +181,7 @@ class Robot:
         self.queue: list[tuple[str, Any]] = []
 
     def subscribe(
-        self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth: int = 10
+        self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth=10
     ) -> None:
         self.heard[topic] = heard
 
@@ -207,9 +207,8 @@ def test_a_message_waits_for_the_transform_of_its_stamp(clock: VirtualClock, mon
     found: Any = next(frames)
     assert found.calibrated
     np.testing.assert_allclose(found.sensor_pose.position, [2.0, 0, 1.5])
-    np.testing.assert_allclose(
-        Rotation.from_quat(found.sensor_pose.orientation).as_euler("zyx", degrees=True), [90, 0, 0], atol=1e-9
-    )
+    turned = Rotation.from_quat(found.sensor_pose.orientation).as_euler("zyx", degrees=True)
+    np.testing.assert_allclose(turned, [90, 0, 0], atol=1e-9)
     assert not source.problems()
 
 

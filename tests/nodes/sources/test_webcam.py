@@ -297,9 +297,7 @@ def filmed(camera: str, hidden: range) -> list[PoseRaw]:
 
 
 @contextmanager
-def merging(
-    folder: Path, clock: VirtualClock
-) -> Iterator[tuple[MergeSource, Iterator[PoseRaw | None], list[Publisher]]]:
+def merging(folder: Path, clock: Clock) -> Iterator[tuple[MergeSource, Iterator[PoseRaw | None], list[Publisher]]]:
     """A source that merges two cameras, its frames, and the publishers that it listens to."""
     addresses = [f"ipc://{folder}/{name}" for name in PLACES]
     source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
