@@ -14,6 +14,7 @@ from numba.extending import intrinsic
 
 from steadypose.prior import loop_cache
 from steadypose.prior.compiled import njit
+from steadypose.prior.loop_cache import LOOPS
 
 ADDED = 2.0
 
@@ -174,3 +175,41 @@ def test_what_is_compiled_is_loaded_without_the_modules_of_a_compiler(tmp_path: 
     assert [output.stdout.split("\n")[0] for output in outputs] == [f"{np.sqrt(3.0)} 3.0"] * 2
     assert "numba.np.arrayobj" in outputs[0].stdout
     assert outputs[1].stdout.split("\n")[1] == ""
+
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = """
+import sys
+sys.path[:0] = sys.argv[1:]
+import numpy as np
+from numba.core import event
+from conftest import walk
+from steadypose.nodes.graph.loops import compile_from_the_end
+from steadypose.prior.clean.pipeline import PriorPipeline, load_loops
+from steadypose.prior.clean.settings import PriorSettings
+
+load_loops(PriorSettings())
+pipeline = PriorPipeline(PriorSettings())
+with event.install_recorder("numba:compile") as compiled:
+    for index, frame in enumerate(walk(50, bodies=3)):
+        if 20 <= index < 35:
+            for body in frame.bodies:
+                body.positions[[7, 8, 10, 11, 20, 21]] = np.nan
+        frame.bodies = frame.bodies[: 1 if index >= 45 else 3]
+        pipeline.process(frame)
+print(sorted({str(made.data["dispatcher"]) for _, made in compiled.buffer}))
+compile_from_the_end()
+"""
+
+
+@pytest.mark.timeout(900)  # compiles all loops
+def test_no_loop_is_left_for_a_frame_to_wait_for(tmp_path: Path) -> None:
+    cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}  # what an earlier run compiled would hide what is missing
+    root = Path(__file__).parents[2]
+    paths = [str(root), str(root / "src"), str(root / "tests" / "nodes")]
+    ran = subprocess.run([sys.executable, "-c", SCRIPT, *paths], env=cold, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.strip() == "[]"
+    (folder,) = (tmp_path / "steadypose").iterdir()
+    assert len(list(folder.iterdir())) == LOOPS
