@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
-from steadypose.prior.camera.calibration import Board, Corners, Intrinsics, find_corners
+from steadypose.prior.camera.calibration import Board, Intrinsics
 
 LENS = Intrinsics((1280, 720), (860.0, 855.0), (645.0, 352.0), (0.05, -0.12, 0.0008, -0.0005, 0.03))
 """Lens of an OAK's colour camera, about; the distortion is stronger."""
@@ -75,11 +75,6 @@ def picture(pose: Pose, lens: Intrinsics, looks: Floats, rng: np.random.Generato
     light = 0.8 + np.add.outer(np.linspace(-1, 1, lens.size[1]) * slope[1], np.linspace(-1, 1, lens.size[0]) * slope[0])
     seen = cv2.GaussianBlur(seen * np.clip(light, 0.4, 1.0), (0, 0), blur) + rng.normal(0.0, noise, seen.shape)
     return np.clip(np.round(seen), 0, 255).astype(np.uint8)
-
-
-def corners_of(pose: Pose, looks: Floats, rng: np.random.Generator) -> Corners | None:
-    """What is found of the board in a picture with the blur and noise of an ordinary room."""
-    return find_corners(picture(pose, LENS, looks, rng, blur=rng.uniform(0.6, 1.1), noise=rng.uniform(2.0, 5.0)), BOARD)
 
 
 def held_poses(rng: np.random.Generator) -> Iterator[Pose]:

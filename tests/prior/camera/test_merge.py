@@ -1,7 +1,6 @@
-"""Several cameras as one: simulated views of one motion, and what can go wrong with them."""
+"""Several cameras as one, and what can go wrong with them."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,13 +8,8 @@ from tests.helpers.bodies import waving
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
 from steadypose.prior.camera.multi_view import DEPTH_ERROR_RATIO, PERIOD_NS, CameraBody, Merge, merge_joints
-from steadypose.prior.sim.camera import Camera, film
-from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
-from steadypose.prior.sim.scripts import SCRIPTS
-from steadypose.prior.sim.streams import START_NS
 
 BODY = waving(60)
-FRONT, BACK = Camera((0.0, 0.0, 1.3), (2.8, 0.0, 1.0)), Camera((5.6, 0.3, 1.5), (2.8, 0.0, 1.0), fps=27.0)
 
 
 def seen(
@@ -31,37 +25,6 @@ def seen(
 def play(messages: list[PoseRaw]) -> tuple[list[PoseRaw], Merge]:
     merge = Merge()
     return [merged for m in sorted(messages, key=lambda m: m.stamp_ns) for merged in merge.update(m)], merge
-
-
-@pytest.fixture(scope="module")
-def two_views() -> tuple[list[PoseRaw], list[PoseRaw], Callable[[np.ndarray], np.ndarray]]:
-    """Somebody who walks about, filmed from both sides of the room, and where his joints really are."""
-    person = SCRIPTS["walk_turn"](np.random.default_rng(4))[0]
-    keep = person.times <= 6.0
-    cut = {name: getattr(person, name)[keep] for name in ("times", "root", "rotations", "contacts")}
-    person, noise = dataclasses.replace(person, **cut), NoiseModel.load(KINECT_NOISE)
-    front, back = (
-        film([person], camera, noise, np.random.default_rng(seed), name, START_NS)
-        for seed, (name, camera) in enumerate((("front", FRONT), ("back", BACK)))
-    )
-    return front, back, lambda stamps_ns: person.at((stamps_ns - START_NS) / 1e9).positions
-
-
-def test_two_views_are_nearer_to_the_truth_than_one_and_lose_fewer_joints(two_views) -> None:
-    """Than one on average: most of a sensor's error is a bias of its session, and one of two cameras has less of it."""
-    front, back, truth = two_views
-
-    def figures(messages: list[PoseRaw]) -> tuple[float, float]:
-        """Metres, median over joints seen, and how many are seen of a body that is there."""
-        merged, _ = play(messages)
-        joints = np.array([m.bodies[0].positions for m in merged if m.bodies])
-        away = np.linalg.norm(joints - truth(np.array([m.stamp_ns for m in merged if m.bodies])), axis=-1)
-        observed = np.isfinite(away)
-        return float(np.nanmedian(away)), float(observed.sum(axis=1).mean())
-
-    both, one, other = figures([*front, *back]), figures(front), figures(back)
-    assert both[0] < 0.85 * (one[0] + other[0]) / 2
-    assert both[1] > max(one[1], other[1])
 
 
 def test_bodies_are_interpolated_to_the_moment() -> None:

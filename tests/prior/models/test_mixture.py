@@ -223,9 +223,3 @@ def test_bodies_do_not_touch_each_other_and_the_same_gives_the_same() -> None:
     assert (places(together)[:, 1:2] == places(alone)).all()
     assert all((a.sigma[1] == b.sigma[0]).all() for a, b in zip(together, alone, strict=True))
     assert (places(smoothed(seen, 4)) == places(together)).all()
-
-
-def test_every_frame_is_answered_once_with_its_stamp() -> None:
-    found = smoothed(walk(20), 4)
-    np.testing.assert_allclose([one.stamp_s for one in found], np.arange(20) / FPS)
-    assert len(smoothed(walk(3), 16)) == 3

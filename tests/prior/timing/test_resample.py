@@ -71,14 +71,6 @@ def test_a_joint_hidden_for_long_is_missing_in_between_and_a_short_gap_is_bridge
         assert not any(np.isnan(p[1]).any() for _, p, _ in frames)
 
 
-def test_a_slow_camera_is_interpolated_between_its_frames() -> None:
-    step = 2 * PERIOD_NS
-    assert step < resample.MAX_GAP_NS
-    frames = feed([k * step for k in range(10)])
-    assert all(np.isfinite(p).all() for _, p, _ in frames)
-    assert frames[3][1][0, 0, 0] == pytest.approx(3 * PERIOD_NS * 1e-9)
-
-
 def test_each_frame_of_a_camera_too_slow_to_be_interpolated_counts_at_one_grid_time() -> None:
     stamps = np.arange(100) * 200_000_000 + np.random.default_rng(0).integers(0, PERIOD_NS, 100)
     seen = [frame for frame in feed(stamps.tolist()) if np.isfinite(frame.positions).all()]
