@@ -53,7 +53,7 @@ def test_a_camera_errs_along_its_line_of_sight() -> None:
     assert (confidence == 1.0).all()
 
 
-def test_confidence_weighs_and_what_is_apart_is_not_averaged() -> None:
+def test_confidence_and_distance_weigh_and_what_is_apart_is_not_averaged() -> None:
     place = np.tile([3.0, 0.0, 1.0], (22, 1))
     eyes = np.array([0.0, 0.0, 1.0]), np.array([6.0, 0.0, 1.0])
     sure = CameraBody(place, np.full(22, 0.9), eyes[0])
@@ -61,6 +61,8 @@ def test_confidence_weighs_and_what_is_apart_is_not_averaged() -> None:
     joints, confidence = merge_joints([sure, unsure])
     assert joints[0, 1] == pytest.approx(0.1 * 0.3**2 / (0.9**2 + 0.3**2), rel=1e-2)
     assert confidence[0] == pytest.approx(1.0 - 0.1 * 0.7)
+    near = dataclasses.replace(unsure, confidence=sure.confidence, eye=np.array([4.5, 0.0, 1.0]))
+    assert merge_joints([sure, near])[0][0, 1] == pytest.approx(0.1 * 4 / 5, rel=1e-2), "at half the distance"
     far = dataclasses.replace(unsure, joints=place + [0.0, 0.5, 0.0])
     joints, confidence = merge_joints([sure, far])
     assert joints == pytest.approx(place)
