@@ -56,7 +56,6 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 @pytest.fixture
 def own_layouts() -> Iterator[None]:
-    """Layouts that the test adds are gone after it."""
     before = dict(layouts._SKELETONS)
     yield
     layouts._SKELETONS.clear()

@@ -210,7 +210,6 @@ def left_out(scale: float) -> list[tuple[kinect_methods.Scores, np.ndarray]]:
 
 @pytest.fixture
 def result(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Result:
-    """The study of everybody, with methods that learn nothing."""
     asked: list[tuple[Any, ...]] = []
 
     def answer(some: Sequence[Clip], scale: float, states: bool) -> tuple[list[np.ndarray], list[Stated] | None]:

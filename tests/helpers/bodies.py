@@ -61,7 +61,6 @@ def raw(
     confidence: float = 1.0,
     pose: Pose | None = None,
 ) -> PoseRaw:
-    """A ``pose/raw`` message."""
     return PoseRaw(
         stamp_ns=stamp_ns,
         frame_id="world",
@@ -74,7 +73,6 @@ def raw(
 
 
 def stream(positions: np.ndarray, start_ns: int = 10**18, **keywords) -> list[PoseRaw]:
-    """One body of (T, J, 3) as messages at 30 Hz."""
     return [raw(start_ns + k * PERIOD_NS, {7: p}, **keywords) for k, p in enumerate(positions)]
 
 

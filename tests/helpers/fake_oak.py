@@ -203,8 +203,6 @@ def plugged(
 
 
 def opener(make: Callable[[Clock], list[tuple[str, dai.Buffer]]]):
-    """A stand-in for `nodes.sources.oak_device.connect`."""
-
     @contextmanager
     def connect(settings: OakSettings, clock: Clock) -> Iterator[Host]:
         with plugged(make(clock), clock) as host:

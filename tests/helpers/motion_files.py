@@ -97,7 +97,6 @@ Frame Time: 0.04
 
 
 def npz(**arrays: Any) -> io.BytesIO:
-    """An archive of these arrays."""
     file = io.BytesIO()
     np.savez(file, **arrays)
     file.seek(0)

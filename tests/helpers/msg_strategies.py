@@ -34,7 +34,6 @@ def _raw_bodies(draw: st.DrawFn) -> RawBody:
 
 
 def of(kind: type) -> st.SearchStrategy[Any]:
-    """Any message of a kind that can be."""
     if kind is RawBody:
         return _raw_bodies()
     if kind is bool:

@@ -18,7 +18,6 @@ def another_python(
     python: Sequence[str] = (sys.executable,),
     environment: Mapping[str, str] | None = None,
 ) -> Iterator[subprocess.Popen[str]]:
-    """A Python process with this script, written to ``folder``, ended with the block at the latest."""
     file = folder / f"script{len(list(folder.glob('script*.py')))}.py"
     file.write_text(script)
     environment = {**(os.environ if environment is None else environment), "PYTHONPATH": str(SOURCES)}

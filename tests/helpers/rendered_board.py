@@ -98,7 +98,6 @@ def floor_poses(rng: np.random.Generator) -> Iterator[Pose]:
 
 
 def error(pose: Pose, truth: Pose) -> tuple[float, float]:
-    """Millimetres and degrees between two poses."""
     turn = Rotation.from_quat(pose.orientation).inv() * Rotation.from_quat(truth.orientation)
     return 1e3 * float(np.linalg.norm(pose.position - truth.position)), float(np.degrees(turn.magnitude()))
 

@@ -19,5 +19,4 @@ class Kept:
         self.dropped.append(topic)
 
     def of(self, topic: str) -> list[Any]:
-        """The messages on a topic, read again."""
         return [deserialise(cdr, kind) for name, kind, cdr, _ in self.sent if name == topic]

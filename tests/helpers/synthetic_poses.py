@@ -127,5 +127,4 @@ def _world(body: int, positions, rotations, velocity, state, sigma: float) -> ty
 
 
 def messages_on(topic: str, seconds: float, **options: Any) -> list[Any]:
-    """Those of `messages` on one topic."""
     return [message for on, message in messages(seconds, **options) if on == topic]

@@ -218,7 +218,6 @@ def foreign(
     path: Path, definition: str, name="steadypose_msgs/msg/PoseRaw", topic="/pose/raw", encoding="cdr",
     payload: bytes | None = None, compression=CompressionType.NONE, stamps=(5, 5), **options: Any,
 ) -> Path:  # fmt: skip
-    """A recording of two messages made by somebody else."""
     writer = Writer(str(path), compression=compression, **options)
     writer.start("ros2", "somebody")
     schema = writer.register_schema(name, "ros2msg", definition.encode())

@@ -52,7 +52,6 @@ def rogue() -> Iterator[zmq.Socket[bytes]]:
 
 @contextmanager
 def hearing(rogue: zmq.Socket[bytes], *topics: str, **options: Any) -> Iterator[Subscriber]:
-    """A subscriber to these topics of a rogue's, which has heard of it."""
     where = rogue.get_string(zmq.LAST_ENDPOINT)
     with Subscriber(where, topics or POSE_RAW, clear_text=True, **options) as subscriber:
         for _ in topics or (POSE_RAW,):
@@ -74,7 +73,6 @@ def wait_until(condition: Callable[[], Any]) -> Any:
 
 
 def stamps_until(subscriber: Subscriber, last: int) -> list[int]:
-    """The stamps of what comes, up to that of `last`."""
     stamps = []
     while not stamps or stamps[-1] < last:
         received = subscriber.receive(SOON_S)
@@ -87,7 +85,6 @@ def stamps_until(subscriber: Subscriber, last: int) -> list[int]:
 def connected(
     at: str, topics: str | Iterable[str] = POSE_RAW, **options: Any
 ) -> Iterator[tuple[Publisher, Subscriber]]:
-    """A publisher, and a subscriber that is connected to it."""
     with Publisher(at) as publisher, Subscriber(publisher.endpoint, topics, name="test", **options) as subscriber:
         assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         yield publisher, subscriber

@@ -23,7 +23,6 @@ FRAMES = 150
 
 
 def recorded(name: str, kind: type[Kind]) -> list[Kind]:
-    """The messages of a bundled stream of this type: what the sensor gave, or the truth."""
     return [message for _, message in open_recording(bundled("sim_data", name)) if isinstance(message, kind)]
 
 

@@ -20,7 +20,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("ros")]
 
 @pytest.fixture
 def graph(ros: None) -> Iterator[Any]:
-    """A node of rclpy's, to look around with."""
     import rclpy
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor

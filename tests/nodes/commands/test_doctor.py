@@ -205,8 +205,6 @@ def test_what_to_type_can_be_typed_here(checkout: bool, prefix: str, command: st
 
 
 class Tracker(Node):
-    """Publishes frames, again and again."""
-
     name = "pose_input"
     frames: tuple[PoseRaw, ...] = ()
 

@@ -29,7 +29,6 @@ def recording(tmp_path: Path) -> Path:
 
 
 def published(endpoint: str, command: Callable[[], object]) -> object:
-    """Run a command in a thread while poses are published at ``endpoint``, until it ends; what it returns."""
     stream = itertools.cycle(messages(0.5))
     with (
         Publisher(endpoint) as publisher,

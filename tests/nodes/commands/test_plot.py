@@ -50,7 +50,6 @@ def drawn(recording: Path) -> bool:
 
 
 def hide(_: str, message: Message) -> None:
-    """Of nothing seen, and nothing known of contacts."""
     if isinstance(message, PoseRaw):
         message.bodies[0].positions[:] = np.nan
     if isinstance(message, PoseClean):

@@ -40,7 +40,6 @@ def start(clock: VirtualClock, said: list[str]) -> Iterator[Start]:
 
 
 def ended(child: Child) -> None:
-    """Wait for the process, and let the child see it."""
     child._process.wait(30)
     child.poll()
 
@@ -184,7 +183,6 @@ def test_what_another_runs_nodes_say_is_not_believed(clock: VirtualClock, make_l
 
 
 def shown(diagnostics: dict[str, Diagnostics], width: int) -> str:
-    """The table as it is printed."""
     console = Console(width=width)
     with console.capture() as capture:
         console.print(table(NODES, diagnostics, Processes(*NODES), width))  # type: ignore[arg-type]

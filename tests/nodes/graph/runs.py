@@ -18,8 +18,6 @@ INPUT_ALONE = ("--set", 'nodes=["pose_input"]', "--set", "recorder.free_mb=0")
 
 
 class Run:
-    """`steadypose run` in a process, with its sockets in a folder, and what it says of itself."""
-
     def __init__(self, folder: Path, *arguments: str) -> None:
         self._health = folder / "steadypose" / HEALTH_FILE
         self._output = (folder / "output").open("w+")

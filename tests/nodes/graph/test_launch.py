@@ -264,7 +264,6 @@ def test_reading_a_launch_file_takes_none_of_the_nodes_libraries() -> None:
 
 @pytest.fixture
 def package(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """An installed package, ``acme``."""
     before = dict(NODES)
     module = ModuleType("acme")
     monkeypatch.setitem(sys.modules, "acme", module)

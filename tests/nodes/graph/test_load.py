@@ -134,7 +134,6 @@ def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
 
 
 def kept(inbox: Inbox) -> list[Message]:
-    """All that an inbox gives."""
     return [message for _, message in iter(lambda: inbox.next(0), None)]
 
 

@@ -45,8 +45,6 @@ class Echo(Node):
 
 
 class Listener(Subscriber):
-    """A test's own subscriber, which keeps what comes."""
-
     def __init__(self, launch: Launch, node: str, topics: list[str], name: str = "") -> None:
         super().__init__(launch.transport.endpoint(node), topics, name=name)
         self.got: list[Any] = []

@@ -49,7 +49,6 @@ def test_a_port_that_is_taken_is_said_with_what_to_do() -> None:
 
 
 def first_message(port: int, topic: str) -> tuple[dict[str, Any], bytes]:
-    """What a server says of a topic's channel, and the first message on it."""
     client = pytest.importorskip("websockets.sync.client", reason="the extra 'web' is not installed")
     with client.connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
         offered: dict[str, dict[str, Any]] = {}

@@ -22,7 +22,6 @@ def free(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 @pytest.fixture
 def recorder(tmp_path: Path, make_launch, clock: VirtualClock, free: SimpleNamespace) -> RecorderNode:
-    """One that records to ``out``."""
     node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
     node._writer = node._settings.writer()
     return node

@@ -321,7 +321,6 @@ def test_a_sourced_rclpy_finds_what_it_imports() -> None:
 
 @pytest.fixture(params=["dds.DdsConnection", "rclpy_connection.RclpyConnection"])
 def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Connection]]:
-    """Each way into ROS."""
     module, _, name = request.param.partition(".")
     given = ("test",) if module.startswith("rclpy") else ()
     with ExitStack() as opened:
@@ -347,7 +346,6 @@ def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> 
 
 
 def body(turns: dict[str, Rotation], root: Rotation | None = None) -> WorldBody:
-    """A body on the generic bones, with these local rotations."""
     local = Rotation.concatenate([turns.get(name, Rotation.identity()) for name in J])
     local = Rotation.concatenate([(root or Rotation.identity()) * local[0], local[1:]])
     return world_body(fk(local.as_matrix()), local.as_quat(), id=3)

@@ -82,7 +82,6 @@ def colours(archetype: Any) -> set[str]:
 
 
 def draw(view: PoseView, seconds: float, *topics: str) -> None:
-    """A walker, as these topics tell of him."""
     for topic, message in messages(seconds):
         if topic in topics:
             view.log(topic, message)
@@ -234,8 +233,6 @@ def test_the_server_goes_with_a_node_that_is_killed() -> None:
 
 
 class Server(nullcontext[Any]):
-    """Stands in for `ViewerServer`: no process."""
-
     url, stopped = "http://somewhere", False
 
     def __init__(self, port: int, host: str) -> None:

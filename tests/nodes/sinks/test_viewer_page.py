@@ -25,7 +25,6 @@ TIMEOUT_S, RELOAD_S = 240.0, 45.0
 
 
 def pixels(screenshot: bytes, panel: int, colour: np.ndarray | list[int]) -> int:
-    """How many pixels of a panel have about this colour."""
     image = np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
     part = image[:PANELS, panel * WIDTH // 3 : (panel + 1) * WIDTH // 3]
     return int((np.abs(part - np.asarray(colour)).max(axis=-1) < 40).sum())

@@ -55,13 +55,11 @@ def sent() -> Kept:
 
 
 def frames(sent: Kept) -> set[str]:
-    """All that TF has."""
     told = [one for topic in ("tf", "tf_static") for message in sent.of(topic) for one in message.transforms]
     return {name for one in told for name in (one.header.frame_id, one.child_frame_id)}
 
 
 def published(sent: Kept) -> dict[str, tuple[str, bool]]:
-    """Type, and whether it is latched, of each topic."""
     return {f"/{topic}": (kind, latched) for topic, kind, _, latched in sent.sent}
 
 

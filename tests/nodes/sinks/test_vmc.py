@@ -22,7 +22,6 @@ from steadypose.nodes.sinks.datagrams import BONES, VmcNode, osc_bundles
 
 
 def world() -> PoseWorld:
-    """Of somebody who walks, as it truly was."""
     return synthetic_poses.messages_on(POSE_TRUTH, 0.5)[-1]
 
 

@@ -43,7 +43,6 @@ def server() -> Iterator[WebServer]:
 
 @pytest.fixture
 def opened(browser: Any, server: WebServer) -> Iterator[Any]:
-    """A function that opens a path of the server, and the hosts that the page has called, and its errors."""
     page = browser.new_page(viewport={"width": 1000, "height": 600})
     page.called, page.errors = set(), []
     page.on("request", lambda request: page.called.add(urlsplit(request.url).hostname))

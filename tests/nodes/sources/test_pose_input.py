@@ -28,8 +28,6 @@ SECOND_NS = 1_000_000_000
 
 
 class Frames:
-    """A source that gives the messages it was given."""
-
     path = Path("frames")
 
     def __init__(self, stamps_ns: list[int]) -> None:
@@ -80,7 +78,6 @@ def play(launch: Launch, clock: VirtualClock, source: Frames, frames: int | None
 
 
 def waits(sent: list[tuple[int, PoseRaw]]) -> list[float]:
-    """Seconds between one message and the next."""
     return [(b - a) / 1e9 for (a, _), (b, _) in pairwise(sent)]
 
 

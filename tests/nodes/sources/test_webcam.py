@@ -57,8 +57,6 @@ def model(tmp_path: Path) -> str:
 
 
 class Seen:
-    """Sees one body two metres ahead, and notes the images."""
-
     def __init__(self) -> None:
         self.images: list[tuple[np.ndarray, int]] = []
 
@@ -298,7 +296,6 @@ def filmed(camera: str, hidden: range) -> list[PoseRaw]:
 
 @contextmanager
 def merging(folder: Path, clock: Clock) -> Iterator[tuple[MergeSource, Iterator[PoseRaw | None], list[Publisher]]]:
-    """A source that merges two cameras, its frames, and the publishers that it listens to."""
     addresses = [f"ipc://{folder}/{name}" for name in PLACES]
     source = MergeSource(MergeSettings(addresses), SourceContext(clock, CalibrationSettings()))
     frames = source.frames()
