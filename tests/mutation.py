@@ -148,9 +148,7 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             if ast.dump(first) != ast.dump(last):
                 changed.elts[0], changed.elts[-1] = last, first
                 yield changed
-        case ast.Call(func=func, args=[first, *_, last]) if not any(
-            isinstance(end, ast.Starred) for end in (first, last)
-        ):
+        case ast.Call(func=func, args=[first, *_, last]) if ast.Starred not in map(type, (first, last)):
             if ast.dump(first) != ast.dump(last) and ast.unparse(func).rpartition(".")[2] not in SYMMETRIC:
                 changed.args[0], changed.args[-1] = last, first
                 yield changed
@@ -247,9 +245,7 @@ def main() -> int:
     parser.add_argument("--tests", nargs="+", help="arguments of pytest; if omitted, chosen for each mutant")
     parser.add_argument("--sample", type=int, help="number of mutants, drawn at random; all if omitted")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--kept", type=Path, help="file that keeps which functions each test file runs, for later calls"
-    )
+    parser.add_argument("--kept", type=Path, help="file that keeps which functions each test file runs")
     options = parser.parse_args()
     paths = [path.resolve() for path in options.code]
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]

@@ -32,7 +32,8 @@ def test_simulated_clips_are_bodies_on_a_floor(clips: MotionClips) -> None:
     assert clips.contacts.shape == (45, 6, 8)
     assert clips.positions[..., 2].min() > -0.05
     length = np.linalg.norm(clips.positions[:, :, J["left_knee"]] - clips.positions[:, :, J["left_hip"]], axis=-1)
-    np.testing.assert_allclose(length, np.linalg.norm(clips.offsets[:, J["left_knee"]], axis=-1)[None], rtol=0.01)
+    bones = np.linalg.norm(clips.offsets[:, J["left_knee"]], axis=-1)
+    np.testing.assert_allclose(length, np.tile(bones, (45, 1)), rtol=0.01)
 
 
 def test_the_clips_that_travel_farthest_are_kept_in_order_as_many_of_each_person(clips: MotionClips) -> None:
@@ -111,9 +112,7 @@ def test_every_search_spends_its_budget_and_finds_one_parameter_within_a_few_per
     assert all(0.01 <= p["a"] <= 100.0 and 0.01 <= p["b"] <= 10.0 for p in asked)
     assert found.parameters == {key: min(found.tried, key=lambda t: t["position_mm"] + t["acceleration_mm"])[key]
                                 for key in ("a", "b")}  # fmt: skip
-    found = search(
-        {"a": (1e-3, 1e3)}, lambda p: {"position_mm": np.log(p["a"] / 7) ** 2, "acceleration_mm": 0}, budget=18
-    )
+    found = search({"a": (1e-3, 1e3)}, lambda p: {"position_mm": np.log(p["a"] / 7) ** 2, "acceleration_mm": 0}, 18)
     assert np.log(found.parameters["a"]) == pytest.approx(np.log(7.0), abs=0.04 * np.log(1e6))
 
 

@@ -87,9 +87,7 @@ def test_the_publishers_frames_arrive(tmp_path: Path):
     assert not subscriber.dropped
 
 
-@pytest.mark.skipif(
-    shutil.which("g++") is None, reason="needs g++, which no Python package brings: install a C++ compiler"
-)
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++: install a C++ compiler")
 def test_the_cpp_program_reads_what_the_python_program_does(tmp_path: Path):
     (code,) = programs("other_languages.md", "cpp")
     (tmp_path / "program.cpp").write_text(code)

@@ -5,7 +5,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -82,9 +82,7 @@ def stamps_until(subscriber: Subscriber, last: int) -> list[int]:
 
 
 @contextmanager
-def connected(
-    at: str, topics: str | Iterable[str] = POSE_RAW, **options: Any
-) -> Iterator[tuple[Publisher, Subscriber]]:
+def connected(at: str, topics: Collection[str] = POSE_RAW, **options: Any) -> Iterator[tuple[Publisher, Subscriber]]:
     with Publisher(at) as publisher, Subscriber(publisher.endpoint, topics, name="test", **options) as subscriber:
         assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
         yield publisher, subscriber

@@ -267,9 +267,7 @@ def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> N
 
 
 @pytest.mark.parametrize(("factor", "order", "cause"), [(1000.0, (0, 1, 2), "unit: "), (1.0, (1, 2, 0), "up_axis: ")])
-def test_what_cannot_be_trusted_is_written_with_status_1(
-    factor: float, order: Any, cause: str, joints, tmp_path, capsys
-):
+def test_what_cannot_be_trusted_has_status_1(factor: float, order: Any, cause: str, joints, tmp_path, capsys):
     write_npz(tmp_path / "in.npz", factor * joints[..., order])
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 1
     told = capsys.readouterr().err

@@ -90,9 +90,7 @@ class Marking(HumorNet):
 
 
 @pytest.mark.parametrize(("done", "share"), [(0.0, 0.0), (0.15, 0.0), (0.25, 0.5), (0.35, 1.0), (1.0, 1.0)])
-def test_steps_start_from_the_true_state_at_first_and_the_models_own_at_last(
-    motion: MotionSet, done: float, share: float
-):
+def test_steps_start_from_the_true_state_at_first_and_the_models_own_at_last(motion, done: float, share: float):
     torch.manual_seed(0)
     net, rng = Marking(HumorConfig(hidden=64, latent=6)), np.random.default_rng(0)
     transition_loss(net, Sequences.of(motion).draw(128, 6, rng), done, rng)

@@ -222,9 +222,7 @@ def test_a_kinects_correction_is_of_the_subjects_that_are_named(tmp_path: Path, 
 
 
 @pytest.mark.parametrize(("steps", "evaluations"), [(50, 1), (250, 2), (None, 40)])
-def test_a_training_says_its_mean_error_since_the_last_evaluation(
-    steps: int | None, evaluations: int, tmp_path, monkeypatch
-):
+def test_a_training_says_its_mean_error_since_the_last_evaluation(steps, evaluations: int, tmp_path, monkeypatch):
     kept: dict[str, Any] = {}
 
     class Kept:

@@ -108,9 +108,7 @@ def test_another_python_and_a_busy_processor_are_told(monkeypatch: pytest.Monkey
     ("runtime", "verdict", "found"),
     [(".", Verdict.GOOD, "latency"), ("file", Verdict.BAD, "Not a directory"), ("x" * 100, Verdict.BAD, "too long")],
 )
-def test_a_message_arrives_where_sockets_can_be(
-    runtime: str, verdict: Verdict, found: str, monkeypatch, tmp_path
-) -> None:
+def test_a_message_arrives_where_sockets_can_be(runtime: str, verdict: Verdict, found: str, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / runtime))
     finding = only(checks.check_messages)

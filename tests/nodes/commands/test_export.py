@@ -202,9 +202,7 @@ def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: F
         ("back.npz", "take.bvh", [], "stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"),
     ],
 )
-def test_what_cannot_be_written_is_said(
-    source: str, out: str, more: list[str], said: str, tmp_path, motion, capsys
-) -> None:
+def test_what_cannot_be_written_is_said(source: str, out: str, more: list[str], said: str, tmp_path, motion, capsys):
     npz(tmp_path / "clean.npz", motion)
     npz(tmp_path / "back.npz", motion, backwards=True)
     np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)

@@ -230,9 +230,7 @@ def note_for(clock: VirtualClock, limit: BodyLimit, seconds: float, *, busy: flo
 
 
 @pytest.mark.parametrize(("busy", "in_time", "fewer"), [(0.9, 0.7, True), (0.9, 0.98, False), (0.3, 0.7, False)])
-def test_bodies_are_left_out_only_where_they_take_the_time(
-    clock: VirtualClock, busy: float, in_time: float, fewer: bool
-):
+def test_bodies_are_left_out_where_they_take_the_time(clock: VirtualClock, busy: float, in_time: float, fewer: bool):
     limit = BodyLimit(8, clock)
     note_for(clock, limit, 1.2, busy=busy, in_time=in_time)
     assert (limit.bodies < 8) == fewer

@@ -170,9 +170,7 @@ def test_the_whole_message_goes_out_in_its_own_type_and_transforms_lead_to_every
     assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="odom")
     told = kept.of("tf")[-1]
     buffer.add(told, static=False)
-    assert {it.child_frame_id for it in told.transforms} == {
-        f"{link}_{name}" for link in LINKS for name in ("b0", "b1")
-    }
+    assert {it.child_frame_id for it in told.transforms} == {f"{link}_{b}" for link in LINKS for b in ("b0", "b1")}
     for name, body in zip(("b0", "b1"), world.bodies, strict=True):
         for link, (place, turned) in frames(body).items():
             at, quaternion = buffer.lookup("odom", f"{link}_{name}", world.stamp_ns)

@@ -180,9 +180,7 @@ class Robot:
         self.heard: dict[str, Callable[[bytes], None]] = {}
         self.queue: list[tuple[str, Any]] = []
 
-    def subscribe(
-        self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched: bool = False, depth=10
-    ) -> None:
+    def subscribe(self, topic: str, kind: str, heard: Callable[[bytes], None], *, latched=False, depth=10) -> None:
         self.heard[topic] = heard
 
     def spin(self, timeout_s: float) -> None:

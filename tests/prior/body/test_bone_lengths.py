@@ -97,9 +97,7 @@ def test_lengths_are_the_posterior_of_a_stature_and_each_bones_own() -> None:
     bones = [joint for joint in range(1, 22) if joint <= MIRROR[joint]]
     rest = lengths(REST_OFFSETS)[bones]
     sides = np.array([1 if MIRROR[joint] == joint else 2 for joint in bones])
-    spread = np.array(
-        [bone_lengths.LIMB_SPREAD if joint in LIMB_ENDS else bone_lengths.TRUNK_SPREAD for joint in bones]
-    )
+    spread = np.array([bone_lengths.LIMB_SPREAD if j in LIMB_ENDS else bone_lengths.TRUNK_SPREAD for j in bones])
     prior = np.diag(spread**2) + bone_lengths.STATURE_SPREAD**2
     bias, noise = bone_lengths.LENGTH_BIASES * BIAS, np.sqrt(2.0) * NOISE
 

@@ -212,9 +212,7 @@ def test_cmus_conversion_is_read_with_the_bones_that_it_lost() -> None:
     ):
         for side, sign in (("left", 1), ("right", -1)):
             np.testing.assert_allclose(found[J[f"{side}_{part}"]][[0, 2]], [sign * x, z], atol=1e-4, err_msg=part)
-    np.testing.assert_allclose(
-        found[[J["spine3"], J["neck"], J["head"]], 2], [0.30, 0.53, 0.62 + 0.2 * 0.18], atol=1e-4
-    )
+    np.testing.assert_allclose(found[[J["spine3"], J["neck"], J["head"]], 2], [0.3, 0.53, 0.62 + 0.2 * 0.18], atol=1e-4)
 
 
 def test_an_npz_of_smpl_x_is_read_without_a_body_model(tmp_path: Path) -> None:

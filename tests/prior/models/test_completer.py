@@ -88,9 +88,7 @@ def test_the_live_form_gives_what_the_network_gives() -> None:
 def test_the_line_is_slerp_and_lerp_and_its_bend_makes_it_a_cubic() -> None:
     rng = np.random.default_rng(3)
     poses = random_pose(rng, 4, 0.2)
-    local = np.stack(
-        [Slerp([0, 30], Rotation.from_matrix(poses[:2, j]))(np.arange(31)).as_matrix() for j in range(22)], 1
-    )
+    local = np.stack([Slerp([0, 30], Rotation.from_matrix(poses[:2, j]))(range(31)).as_matrix() for j in range(22)], 1)
     root = np.cumsum(rng.normal(0.0, 0.02, (31, 3)), axis=0)
     joints = place_joints(local, REST_OFFSETS) + root[:, None]
     seen = joints.copy()
@@ -106,9 +104,7 @@ def test_the_line_is_slerp_and_lerp_and_its_bend_makes_it_a_cubic() -> None:
     assert np.allclose(way[9:26], np.linspace(root[9], root[25], 17), atol=1e-9)
     bend = window.bend[0, :, 22, :3] @ window.turn[0].T
     shown = np.r_[:10, 25:31]
-    assert np.allclose(
-        (way + bend)[9:26], CubicSpline(shown, root[shown], bc_type="natural")(np.arange(9, 26)), atol=1e-5
-    )
+    assert np.allclose((way + bend)[9:26], CubicSpline(shown, root[shown], bc_type="natural")(range(9, 26)), atol=1e-5)
     given = Rotation.from_matrix(solved[shown, J["left_knee"]]).as_quat()
     given *= np.where(given @ given[0] < 0, -1.0, 1.0)[:, None]
     turned = CubicSpline(shown, given, bc_type="natural")(np.arange(9, 26))

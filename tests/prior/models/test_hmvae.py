@@ -99,9 +99,7 @@ def test_training_writes_weights_and_curves_and_ends_the_same_twice(tmp_path: Pa
     monkeypatch.setattr("steadypose.prior.models.weights.WEIGHTS", tmp_path / "weights")
     monkeypatch.setattr("steadypose.training.recipes.hmvae.SHORT", replace(SHORT, batch=4))
     data = prepared(tmp_path / "m.npz")
-    first, second = (
-        train_hmvae(TrainingOptions(data, tmp_path / run, iterations=3)).read_bytes() for run in ("a", "b")
-    )
+    first, second = (train_hmvae(TrainingOptions(data, tmp_path / run, iterations=3)).read_bytes() for run in "ab")
     assert first == second
     assert [c["step"] for c in json.loads((tmp_path / "b/hmvae-default/curves.json").read_text())] == [1, 2, 3]
     assert (tmp_path / "b/hmvae-default/curves.png").stat().st_size > 1000

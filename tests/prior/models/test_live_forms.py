@@ -59,9 +59,7 @@ def test_faults(seed: int) -> None:
     with torch.inference_mode():
         expected = network(torch.from_numpy(features)).numpy()
     live = LiveFaultNet(config, arrays_of(network), max_batch=4)
-    np.testing.assert_allclose(
-        live(x, found, sigma, observed, sensor_sigma), expected, atol=1e-5 * np.abs(expected).max()
-    )
+    np.testing.assert_allclose(live(x, found, sigma, observed, sensor_sigma), expected, atol=1e-5 * abs(expected).max())
 
 
 @SEEDS
