@@ -247,4 +247,4 @@ def test_people_are_the_same_in_all_files_of_a_source(tmp_path: Path) -> None:
     clips = [replace(a_clip(standing(40)), source=source, subject="02") for source in ("CMU (AMC)", "CMU (BVH)", "X")]
     path = tmp_path / "prepared.npz"
     write_prepared([p for c in clips for p in prepare_clip(c, "default", "val") if isinstance(p, Prepared)], path)
-    assert MotionSet.load(path, "default", "val").person.tolist() == ["CMU 02", "CMU 02", "Other 02"]
+    assert MotionSet.load(path, "default", "val").person.tolist() == ["CMU 02", "CMU 02", "X 02"]
