@@ -37,14 +37,14 @@ def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
     """(B, 2) parent and child of the bones to draw between the canonical joints that a sensor has, ``observable``
     (22,).
 
-    A joint that the sensor's skeleton lacks is skipped, and its children are connected to its nearest ancestor. For a
-    joint that is missing only temporarily, leave out its bones instead.
+    A joint that the sensor's skeleton lacks is skipped, and its children are connected to its nearest ancestor; where a
+    collar is skipped, the shoulder to the neck. For a joint that is missing only temporarily, leave out its bones.
     """
     pairs = []
     for child in range(len(JOINTS)):
         parent = PARENTS[child]
         while parent >= 0 and not observable[parent]:
-            parent = PARENTS[parent]
+            parent = J["neck"] if JOINTS[parent].endswith("collar") else PARENTS[parent]
         if observable[child] and parent >= 0:
             pairs.append((parent, child))
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)

@@ -17,11 +17,13 @@ from steadypose.msgs.topics import DIAGNOSTICS, POSE_CLEAN, POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import Diagnostics, JointState, Level, Message, Pose, PoseClean, PoseRaw, PoseWorld
 from steadypose.nodes.commands.small import plot
 from steadypose.nodes.settings import LaunchError
+from steadypose.nodes.sinks.drawing import bones
 from steadypose.nodes.sinks.plot import video as video_of
 from steadypose.nodes.sinks.plot.figure import draw
 from steadypose.nodes.sinks.plot.history import PlotError, errors_of, history_of_path
 from steadypose.nodes.sinks.plot.panels import busiest_joints, draw_contacts
 from steadypose.nodes.sources.source import WebcamSettings
+from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.body.skeleton import J
 
 GONE = object()
@@ -47,6 +49,11 @@ def drawn(recording: Path) -> bool:
     picture = recording.with_suffix(".png")
     plot(recording, picture)
     return picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_arms_of_a_layout_without_collars_hang_at_the_neck() -> None:
+    coco = {tuple(pair) for pair in bones(COCO17.observable).tolist()}
+    assert {(J["neck"], J["left_shoulder"]), (J["neck"], J["right_shoulder"]), (J["pelvis"], J["neck"])} < coco
 
 
 def hide(_: str, message: Message) -> None:
