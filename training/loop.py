@@ -42,12 +42,14 @@ class TrainingOptions:
     runs: Path  # folder of training runs; an interrupted run of the same name resumes there
     weights: str = "default"  # weight set, ``default`` or ``research``; for a sensor's correction, its name
     iterations: int | None = None  # number of optimiser steps, at least 1; None for the model's default
-    seed: int = 0  # random seed of initial weights and of sampling
+    seed: int = 0  # random seed of initial weights and of sampling, at least 0
     start: str | None = None  # weights to start from: a weight set or a path
 
     def __post_init__(self) -> None:
         if self.iterations is not None and self.iterations < 1:
             raise ValueError(f"iterations: expected 1 or more, got {self.iterations}")
+        if self.seed < 0:
+            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
 
     def path(self, model: str) -> Path:
         """Return the path of a model's weights in the folder of its run: ``RUNS/MODEL-SET/MODEL-SET.safetensors``."""

@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from steadypose.nodes.settings import LaunchError
+from steadypose.prior.models.weights import weights_path
 from steadypose.training.data.datasets import WeightSet
 
 RECIPES = {
@@ -94,6 +95,10 @@ def train(
         raise LaunchError(f"--weights: expected {' or '.join(sets)} for {model}, got {name}")
     if start is not None and model == "correction":
         raise LaunchError("--start: a correction is trained from the beginning, in minutes; leave it out")
+    if start is not None:  # before minutes of preparation
+        weights_path(start, "hgvae" if model == "completion" else model)
+    if of_default_alone and not data.is_dir():
+        raise LaunchError(f"--data: expected the folder of the recordings to train {model} on, got {data}")
     try:
         options = TrainingOptions(data, runs, name, iterations, seed, start)
     except ValueError as error:

@@ -59,6 +59,15 @@ def test_options_that_cannot_be_used_are_refused_by_name() -> None:
         command.train("correction", iterations=0)
     with pytest.raises(LaunchError, match="--start: a correction"):
         command.train("correction", start="default")
+    with pytest.raises(LaunchError, match="--seed: expected 0 or more, got -1"):
+        command.train("contacts", seed=-1)
+
+
+def test_what_is_not_there_is_said_before_anything_is_prepared(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no weights 'mine' for hgvae: expected hgvae-mine\.safetensors"):
+        command.train("completion", tmp_path, start="mine")
+    with pytest.raises(LaunchError, match="--data: expected the folder of the recordings to train mixture on, got"):
+        command.train("mixture", tmp_path / "prepared.npz")
 
 
 def prepared(path: Path, *minutes: float, sets: tuple[str, ...] = ("default", "research")) -> Path:
