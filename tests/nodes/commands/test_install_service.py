@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from steadypose import PACKAGE
 from steadypose.nodes.commands import install_service as command
 from steadypose.nodes.commands.install_service import Service, install_service, quoted
 from steadypose.nodes.graph.launch import Launch
@@ -14,6 +15,14 @@ def service(**changed: object) -> Service:
     of = {"name": "poses", "user": "poses", "is_new_user": True, "command": Path("/opt/sp/bin/steadypose"),
           "launch": "/etc/poses/my launch.toml", "groups": ("video",)}  # fmt: skip
     return Service(**(of | changed))  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The checkout, whose recording the launch file names, may itself lie in a home or in /tmp."""
+    for folders, inside in (("HOMES", "/home/a"), ("TEMPORARY", "/tmp/a")):
+        kept = [folder for folder in getattr(command, folders) if not PACKAGE.is_relative_to(folder)]
+        monkeypatch.setattr(command, folders, (*kept, inside))
 
 
 @pytest.fixture
@@ -46,7 +55,7 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     [
         ({"command": Path("/home/a/bin/steadypose")}, {}, "in a home.*/usr/bin/python3 -m venv /opt.*pip install PATH"),
         ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
-        ({"launch": "/tmp/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
+        ({"launch": "/tmp/a/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
         ({}, {"transport.keys": "/home/a/keys"}, "/home/a/keys is in a home"),
         ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
         ({"name": "../x"}, {}, "--name: expected small letters"),
