@@ -24,7 +24,7 @@ from steadypose.nodes.commands.calibrate_files import (
     write_image,
 )
 from steadypose.nodes.commands.calibrate_sensor import CalibrateSensor
-from steadypose.nodes.commands.output import File
+from steadypose.nodes.commands.output import File, check_folder
 from steadypose.nodes.sources.registry import InputSettings
 from steadypose.prior.camera.calibration import (
     MIN_CORNERS,
@@ -76,6 +76,7 @@ class PrintBoard:
             raise CalibrationError(f"--paper: expected one of {', '.join(PAPERS_MM)}, got {self.paper!r}")
         if self.out.suffix not in (".pdf", ".png"):
             raise CalibrationError(f"expected a .pdf or .png to write, got {self.out}")
+        check_folder(self.out)
         width, height = PAPERS_MM[self.paper]
         square = (
             np.floor(2 * min((width - 2 * _MARGIN_MM) / self.columns, (height - 2 * _MARGIN_MM) / self.rows)) / 2

@@ -58,8 +58,13 @@ def check_output(source: Path, *outputs: Path) -> None:
     for out in outputs:
         if source.resolve() == out.resolve():
             raise LaunchError(f"{out}: expected another path than the input's; nothing is written in place")
-        if not out.resolve().parent.is_dir():
-            raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
+        check_folder(out)
+
+
+def check_folder(out: Path) -> None:
+    """Raises LaunchError if the folder of an output does not exist."""
+    if not out.resolve().parent.is_dir():
+        raise LaunchError(f"{out}: expected its folder {out.resolve().parent} to exist; make it first")
 
 
 def check_format(out: Path) -> None:

@@ -102,6 +102,7 @@ def test_the_grid_is_drawn_where_the_floor_is_seen() -> None:
     [
         (["board", "board.txt"], "expected a .pdf or .png"),
         (["board", "board.pdf", "--paper", "b9"], "expected one of a4, a3, letter"),
+        (["board", "{folder}/no/board.pdf"], "to exist; make it first"),
         (["lens", "nowhere.toml", "x"], "no launch file at nowhere.toml"),
         (["lens", "{launch}", "{folder}/nothing"], "expected an image, a folder of images, or a video"),
         (["lens", "{launch}", "{launch}"], "expected an image that OpenCV reads"),
