@@ -100,9 +100,9 @@ def check_range(name: str, value: float, least: float, most: float) -> None:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return the end of an error message, which suggests the most similar known name, if there is one."""
+    """Return the part of an error message that suggests the most similar known name; empty if there is none."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
-    return f", did you mean {close[0]!r}?" if close else ""
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def _kind_of_items(cls: type, key: str) -> type | None:

@@ -116,7 +116,8 @@ def skeleton_name(skeleton: SkeletonLike) -> str:
     if not isinstance(skeleton, Iterable):
         raise NpzError(f"skeleton: expected the name of a layout, or its joints, got {skeleton!r}")
     described = dict(skeleton) if isinstance(skeleton, Mapping) else {"joints": skeleton}
-    described["joints"] = [str(joint) for joint in described.get("joints", ())]
+    if isinstance(joints := described.get("joints"), Iterable) and not isinstance(joints, str):
+        described["joints"] = [str(joint) for joint in joints]
     name = "own_" + hashlib.sha256(json.dumps(described, sort_keys=True, default=list).encode()).hexdigest()[:12]
     try:
         add_layouts({name: described})
@@ -256,8 +257,8 @@ def complete(
         confidence: as in `clean`. Joints with confidence 0 are missing.
         up: as in `clean`.
         weights: weight set of the completer: 'default', or a .safetensors file.
-        seed: draw an alternative instead of the expected motion, another with each seed: what is missing differs from
-            the expected motion by about ``sigma``.
+        seed: draw an alternative instead of the expected motion, another with each seed (0 or more): what is missing
+            differs from the expected motion by about ``sigma``.
 
     Returns:
         The arrays of `clean`, with a row every 1/30 s from the first observation to the last.
@@ -270,6 +271,8 @@ def complete(
     """
     from steadypose.nodes.offline import alternative_of, complete_source, load_completer
 
+    if seed is not None and not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise NpzError(f"seed: expected a whole number, 0 or more, got {seed!r}")
     source = source_of(positions, fps=fps, stamp_ns=stamp_ns, skeleton=skeleton, confidence=confidence, up=up)
     fill, uncertainty = load_completer(weights)
     completed = complete_source(source, fill, uncertainty)

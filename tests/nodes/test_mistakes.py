@@ -70,6 +70,8 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "Human3.6M by its own name": (lambda j: Filter("Human3.6M"), "did you mean 'h36m17'"),
     "OpenPose by its model's name": (lambda j: Filter("BODY_25"), "did you mean 'openpose25'"),
     "no skeleton": (lambda j: Filter(None), "name of a layout, or its joints, got None"),
+    "a layout without joints": (lambda j: Filter({"joints": None}), "joints: expected a list of names, .*, got None"),
+    "a seed below 0": (lambda j: steadypose.complete(j, fps=30, seed=-1), "seed: expected .* 0 or more, got -1"),
     "a skeleton that nobody knows": (lambda j: Filter(skeleton="thing"), "expected one of smpl22, coco17"),
     "no rate": (lambda j: clean(j), "of a regular stream give fps, 30 for instance"),
     "stamps in seconds": (lambda j: clean(j, stamp_ns=seconds()), r"seem to be seconds: np\.round\(stamps \* 1e\+09\)"),
@@ -84,10 +86,10 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "None for a missing joint": (lambda j: clean(with_none(j), fps=30), "NaN"),
     "a file that does not exist": (lambda j: clean("nowhere.npz"), r"nowhere\.npz does not exist: expected"),
     "a file that does not exist, and its rate": (lambda j: clean("hello", fps=30), r"hello does not exist: expected"),
-    "no such setting": (lambda j: clean(j, fps=30, settings={"prior": {"delya": 2}}), "'delya', did you mean 'delay'"),
+    "no such setting": (lambda j: clean(j, fps=30, settings={"prior": {"delya": 2}}), r"'delya' \(did you mean 'del"),
     "a section that there is not": (
         lambda j: Filter(settings={"prior.delay": 2}),
-        r"expected sections 'prior', 'trajectory', 'events'.*got 'prior\.delay', did you mean 'prior'",
+        r"expected sections 'prior', 'trajectory', 'events'.*got 'prior\.delay' \(did you mean 'prior'",
     ),
     "a rate and stamps": (lambda j: clean(j, fps=30, stamp_ns=TICKS), "or stamp_ns, got both; leave fps out"),
     "a rate beside stamps": (lambda j: clean({**STAMPED, "positions": j}, fps=60), "stamp_ns, got both; leave fps out"),
@@ -115,7 +117,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "a number for a section": (lambda j: clean(j, fps=30, settings={"prior": 2}), "settings, such .*; got prior = 2"),
     "an event's threshold that there is not": (
         lambda j: clean(j, fps=30, settings={"events": {"neer": 2.0}}),
-        r"\[events\] has no setting 'neer', did you mean 'near'",
+        r"\[events\] has no setting 'neer' \(did you mean 'near'",
     ),
     "all frames at once": (lambda j: Filter()(j.transpose(0, 2, 1), 0.0), r"expected \(22, 3\) metres"),
 }
@@ -147,7 +149,7 @@ ANSWERED = {
     "clean in.csv nowhere/out.npz": "to exist; make it first",
     "clean blank.csv out.npz": "blank.csv: has no rows: expected a header",
     "clean numbers.csv out.npz": "rename another program's columns to stamp, JOINT_x",
-    "run mine.toml": "[prior.gate] has no setting 'jmup', did you mean 'jump'?",
+    "run mine.toml": "[prior.gate] has no setting 'jmup' (did you mean 'jump'?)",
     "clean in.npy out.npz": "in.npy: cannot be read",
     "clean in.png out.npz": "or a video, got '.png'",
     "plot in.txt": "in.txt: expected a rosbag2 directory, an .mcap",
@@ -156,7 +158,7 @@ ANSWERED = {
     "export in.csv out.bvh": "clean it first: steadypose clean in.csv in.npz",
     "clean in.csv out.npz --events events.json": "events.json: expected a name ending in .csv",
     "clean . ../out --events ../events.csv": "--events: expected a single recording as IN",
-    "clean walk_tern out.npz": "or a video, did you mean 'walk_turn'?",
+    "clean walk_tern out.npz": "or a video (did you mean 'walk_turn'?)",
     "info in.bvh": "in.bvh: expected a body: legs and arms",  # a command without --rig
     "complete in.csv out.npz --samples -1": "--samples: expected 0 or more, got -1",
     "add webcam": "to add an extra: ",  # where steadypose is installed by pip

@@ -51,7 +51,7 @@ def test_help_explains_upgrading_uninstalling_and_each_command(capsys, monkeypat
         main(["help", "keys"])
     assert "usage: steadypose keys" in capsys.readouterr().out
     assert main(["help", "upgrad"]) == USAGE_ERROR
-    assert "no help on 'upgrad', did you mean 'upgrade'?" in capsys.readouterr().err
+    assert "no help on 'upgrad' (did you mean 'upgrade'?)" in capsys.readouterr().err
 
 
 def test_what_a_terminal_would_obey_or_the_encoding_of_stdout_lacks_is_escaped(tmp_path: Path, monkeypatch, capsys):
