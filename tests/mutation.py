@@ -38,16 +38,8 @@ GOAL = 0.85
 """Least share of mutants that tests should kill."""
 
 LIBRARIES = [
-    "hypothesis",
-    "mcap",
-    "numba",
-    "numpy",
-    "pytest",
-    "rosbags.typesys",
-    "scipy.spatial.transform",
-    "torch",
-    "zmq",
-]
+    "hypothesis", "mcap", "numba", "numpy", "pytest", "rosbags.typesys", "scipy.spatial.transform", "torch", "zmq",
+]  # fmt: skip
 """Imported once, before the processes that run tests are forked."""
 
 ELSEWHERE = shutil.ignore_patterns(".venv", ".git", ".uv", ".hypothesis", "__pycache__", ".*_cache")

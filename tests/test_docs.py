@@ -113,26 +113,16 @@ class Terminal:
             self._go_on(block)
         elif block.is_run:
             done = subprocess.run(
-                ["sh", "-ex"],
-                input=block.text,
-                cwd=self._folder,
-                env=self._environment,
-                capture_output=True,
-                text=True,
-                timeout=SOON_S,
-            )
+                ["sh", "-ex"], input=block.text, cwd=self._folder, env=self._environment, capture_output=True,
+                text=True, timeout=SOON_S,
+            )  # fmt: skip
             assert done.returncode == 0, done.stdout + done.stderr
 
     def _go_on(self, block: Block) -> None:
         process = subprocess.Popen(
-            ["sh", "-ec", f"exec {block.text}"],
-            cwd=self._folder,
-            env=self._environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
-        )
+            ["sh", "-ec", f"exec {block.text}"], cwd=self._folder, env=self._environment, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
         self._background.append(process)
         assert process.stdout
         if block.mark.endswith("prints"):

@@ -124,10 +124,8 @@ def test_a_filter_is_chosen_by_the_others_figures() -> None:
     ]  # fmt: skip
     found = Tuned({"density": 0.5}, tried)
     assert [kinect_methods.best_without(s, found, baseline)["density"] for s in ("s01", "s02", "s03")] == [
-        5.0,
-        0.5,
-        0.5,
-    ]
+        5.0, 0.5, 0.5,
+    ]  # fmt: skip
     assert kinect_methods.best_without("s01", Tuned({}, []), baseline) == {}
 
 

@@ -79,17 +79,11 @@ def record(method: str, delay: int, position: float, acceleration: float, condit
 
 def test_the_overview_compares_with_the_nearest_baseline_of_the_cell_that_waits_no_longer() -> None:
     records = [
-        record("raw", 0, 16.0, 40.0),
-        record("bank", 0, 10.0, 8.0),
-        record("bank", 4, 20.0, 1.0),
-        record("bank", 8, 1.0, 1.0),
-        record("bank", 0, 1.0, 1.0, "1 cm"),
-        record("Butterworth, offline", -1, 1.0, 1.0),
-        record("HM-VAE", 4, 1.0, 1.0),
-        record("temporal convolution", 4, 1.0, 1.0),
-        record("steadypose", 4, 10.2, 4.0),
+        record("raw", 0, 16.0, 40.0), record("bank", 0, 10.0, 8.0), record("bank", 4, 20.0, 1.0),
+        record("bank", 8, 1.0, 1.0), record("bank", 0, 1.0, 1.0, "1 cm"), record("Butterworth, offline", -1, 1.0, 1.0),
+        record("HM-VAE", 4, 1.0, 1.0), record("temporal convolution", 4, 1.0, 1.0), record("steadypose", 4, 10.2, 4.0),
         record("steadypose", 0, 9.0, 8.0),
-    ]
+    ]  # fmt: skip
     tiny = [record("raw", 0, 0.0, 0.0), record("steadypose", 0, 0.04, 0.01)]
     assert list(ratios(tiny, "position_mm")) == [("2 cm, delay 0", 1.0, 1.0)], "next to nothing is equal"
     assert {name: pair for name, *pair in ratios(records, "position_mm")} == {

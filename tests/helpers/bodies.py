@@ -62,14 +62,9 @@ def raw(
     pose: Pose | None = None,
 ) -> PoseRaw:
     return PoseRaw(
-        stamp_ns=stamp_ns,
-        frame_id="world",
-        source="test",
-        skeleton=skeleton,
-        sensor_pose=pose or Pose.identity(),
-        calibrated=True,
-        bodies=[RawBody(k, p, np.full(len(p), confidence)) for k, p in bodies.items()],
-    )
+        stamp_ns=stamp_ns, frame_id="world", source="test", skeleton=skeleton, sensor_pose=pose or Pose.identity(),
+        calibrated=True, bodies=[RawBody(k, p, np.full(len(p), confidence)) for k, p in bodies.items()],
+    )  # fmt: skip
 
 
 def stream(positions: np.ndarray, start_ns: int = 10**18, **keywords) -> list[PoseRaw]:

@@ -64,18 +64,10 @@ def clean(stamp_ns: int = 0) -> PoseClean:
 def world(stamp_ns: int = 0) -> PoseWorld:
     joints = np.arange(66).reshape(22, 3)
     body = types.WorldBody(
-        id=7,
-        root_position=np.arange(3),
-        root_orientation=np.array([0, 0, 0, 1]),
-        root_velocity=np.arange(3),
-        covariance=np.arange(36).reshape(6, 6),
-        positions=joints,
-        rotations=np.ones((22, 4)),
-        state=np.full(22, 3),
-        sigma=np.ones(22),
-        contacts=np.ones(8),
-        tracking=types.Tracking.COASTING,
-    )
+        id=7, root_position=np.arange(3), root_orientation=np.array([0, 0, 0, 1]), root_velocity=np.arange(3),
+        covariance=np.arange(36).reshape(6, 6), positions=joints, rotations=np.ones((22, 4)), state=np.full(22, 3),
+        sigma=np.ones(22), contacts=np.ones(8), tracking=types.Tracking.COASTING,
+    )  # fmt: skip
     return PoseWorld(stamp_ns, "world", "test", np.array([0, 0, 1, 0]), [body])
 
 
@@ -91,10 +83,6 @@ def diagnostics(stamp_ns: int = 0) -> Diagnostics:
 
 
 EXAMPLES = {
-    POSE_RAW: raw(),
-    POSE_CLEAN: clean(),
-    POSE_WORLD: world(),
-    POSE_EVENTS: events(),
-    POSE_TRUTH: world(),
+    POSE_RAW: raw(), POSE_CLEAN: clean(), POSE_WORLD: world(), POSE_EVENTS: events(), POSE_TRUTH: world(),
     DIAGNOSTICS: diagnostics(),
-}
+}  # fmt: skip

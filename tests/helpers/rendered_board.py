@@ -64,12 +64,9 @@ def picture(pose: Pose, lens: Intrinsics, looks: Floats, rng: np.random.Generato
     scale = max(1.0, per_metre * float(np.nanmedian(np.where(np.isfinite(reach), reach, np.nan))) / lens.focal[0] / 2)
     paper = cv2.GaussianBlur(paper, (0, 0), 0.5 * scale)
     seen = cv2.remap(
-        paper.astype(np.float32),
-        np.nan_to_num(x, nan=-1e6).astype(np.float32),
-        np.nan_to_num(y, nan=-1e6).astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderValue=110.0,
-    )
+        paper.astype(np.float32), np.nan_to_num(x, nan=-1e6).astype(np.float32),
+        np.nan_to_num(y, nan=-1e6).astype(np.float32), cv2.INTER_LINEAR, borderValue=110.0,
+    )  # fmt: skip
     seen = cv2.resize(seen, lens.size, interpolation=cv2.INTER_AREA)
     slope = rng.uniform(-0.25, 0.25, 2)
     light = 0.8 + np.add.outer(np.linspace(-1, 1, lens.size[1]) * slope[1], np.linspace(-1, 1, lens.size[0]) * slope[0])

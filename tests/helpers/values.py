@@ -28,13 +28,11 @@ def clean_bodies(positions: np.ndarray, **settings: Any) -> list[CleanBody]:
 def observation(positions: np.ndarray, stamp_s: float = 0.0, confidence: np.ndarray | None = None) -> Observation:
     """Of bodies (S, 22, 3) that are all there."""
     return Observation(
-        stamp_s=stamp_s,
-        positions=positions,
+        stamp_s=stamp_s, positions=positions,
         confidence=np.ones(positions.shape[:2]) if confidence is None else confidence,
-        present=np.ones(len(positions), dtype=bool),
-        sensor_position=np.zeros(3),
+        present=np.ones(len(positions), dtype=bool), sensor_position=np.zeros(3),
         layout_sigma=np.zeros(positions.shape[:2]),
-    )
+    )  # fmt: skip
 
 
 def gated(positions: np.ndarray, stamp_s: float = 0.0) -> Gated:

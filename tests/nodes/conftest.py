@@ -75,14 +75,9 @@ def make_launch(folder: Path, tmp_path: Path) -> Callable[..., Launch]:
 def raw(index: int, *bodies: RawBody, stamp_ns: int | None = None, skeleton: str = "smpl22") -> PoseRaw:
     """Frame ``index`` of a 30 Hz stream."""
     return PoseRaw(
-        stamp_ns=START_NS + index * 33_333_333 if stamp_ns is None else stamp_ns,
-        frame_id="camera",
-        source="test",
-        skeleton=skeleton,
-        sensor_pose=Pose.identity(),
-        calibrated=True,
-        bodies=list(bodies),
-    )
+        stamp_ns=START_NS + index * 33_333_333 if stamp_ns is None else stamp_ns, frame_id="camera", source="test",
+        skeleton=skeleton, sensor_pose=Pose.identity(), calibrated=True, bodies=list(bodies),
+    )  # fmt: skip
 
 
 def walking(index: int, body: int = 0) -> RawBody:

@@ -80,13 +80,9 @@ def test_a_lifecycle_starts_and_ends_the_program(graph: Any, start: Callable[...
     launch.write_text('nodes = ["pose_input", "ros2_bridge"]\n[transport]\nlossless = false\n')
     recording = Path(__file__).parents[2] / "sim_data/walk_turn"
     process = start(
-        launch=str(launch),
-        command=str(PROGRAM),
-        autostart="false",
-        input__recording=str(recording),
-        input__loop="true",
-        transport__directory=str(tmp_path / "sockets"),
-    )
+        launch=str(launch), command=str(PROGRAM), autostart="false", input__recording=str(recording),
+        input__loop="true", transport__directory=str(tmp_path / "sockets"),
+    )  # fmt: skip
 
     def topics() -> set[str]:
         return {name for name, _ in graph.get_topic_names_and_types() if graph.count_publishers(name)}

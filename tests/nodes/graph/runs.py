@@ -22,11 +22,9 @@ class Run:
         self._health = folder / "steadypose" / HEALTH_FILE
         self._output = (folder / "output").open("w+")
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "steadypose.nodes.cli", "run", *arguments],
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-        )
+            [sys.executable, "-m", "steadypose.nodes.cli", "run", *arguments], stdout=self._output,
+            stderr=subprocess.STDOUT, env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
+        )  # fmt: skip
 
     def node(self, name: str) -> dict[str, Any]:
         nodes = json.loads(self._health.read_text())["nodes"] if self._health.exists() else {}

@@ -375,12 +375,9 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
     with ExitStack() as stack:
         door, desk = (stack.enter_context(Publisher("tcp://127.0.0.1:*", keys=keys)) for _ in streams)
         launch = make_launch(
-            nodes='["prior", "trajectory"]',
-            server__clients=str([door.endpoint, desk.endpoint]),
-            transport__lossless="false",
-            transport__queue=100,
-            transport__keys=tmp_path / "keys" if secret else "",
-        )
+            nodes='["prior", "trajectory"]', server__clients=str([door.endpoint, desk.endpoint]),
+            transport__lossless="false", transport__queue=100, transport__keys=tmp_path / "keys" if secret else "",
+        )  # fmt: skip
         prior, trajectory = PriorNode(launch, clock), TrajectoryNode(launch, clock)
         stack.enter_context(running(prior, trajectory))
         heard = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")

@@ -213,13 +213,9 @@ def test_no_command_runs_code_of_the_working_folder(arguments: tuple[str, ...], 
     ]
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONSAFEPATH")}
     done = subprocess.run(
-        [Path(sys.executable).with_name("steadypose"), *given],
-        cwd=hostile,
-        env=environment | {"XDG_RUNTIME_DIR": str(folder)},
-        capture_output=True,
-        text=True,
-        timeout=400,
-    )
+        [Path(sys.executable).with_name("steadypose"), *given], cwd=hostile,
+        env=environment | {"XDG_RUNTIME_DIR": str(folder)}, capture_output=True, text=True, timeout=400,
+    )  # fmt: skip
     assert not (tmp_path / "was run").exists(), (tmp_path / "was run").read_text()
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -94,21 +94,16 @@ def test_a_camera_that_goes_is_waited_for_a_moment_only() -> None:
 def test_what_cannot_be_used_is_counted_by_camera() -> None:
     good = [seen("a", k * PERIOD_NS, BODY[k]) for k in range(5)]
     bad = [
-        seen("b", 1, BODY[0], calibrated=False),
-        seen("b", 2, BODY[0], skeleton="octopus"),
+        seen("b", 1, BODY[0], calibrated=False), seen("b", 2, BODY[0], skeleton="octopus"),
         seen("b", 3, BODY[0], sensor_pose=Pose(np.zeros(3), np.zeros(4))),
-        seen("b", 4, skeleton="coco17", bodies=[RawBody(0, BODY[0], np.ones(22))]),
-        seen("a", 4 * PERIOD_NS, BODY[0]),
+        seen("b", 4, skeleton="coco17", bodies=[RawBody(0, BODY[0], np.ones(22))]), seen("a", 4 * PERIOD_NS, BODY[0]),
         seen("c", 5 * PERIOD_NS, np.full((22, 3), np.inf), np.full((22, 3), 1e30), *[BODY[0]] * 200),
-    ]
+    ]  # fmt: skip
     merged, merge = play([*good, *bad])
     assert merged
     assert {cause: n for cause, n in merge.counters.items() if n} == {
-        "not calibrated, b": 2,
-        "unknown skeleton, b": 1,
-        "wrong joint count, b": 1,
-        "late or repeated, a": 1,
-    }
+        "not calibrated, b": 2, "unknown skeleton, b": 1, "wrong joint count, b": 1, "late or repeated, a": 1,
+    }  # fmt: skip
 
 
 def test_cameras_whose_clocks_were_set_back_start_anew() -> None:

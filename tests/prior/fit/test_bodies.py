@@ -151,15 +151,9 @@ def track(joints: np.ndarray, load: float = 0.5) -> FittedTrack:
     offsets[0, 1], offsets[1, 1] = [0.1, 0.0, 0.0], [0.3, 0.0, 0.0]
     ground = np.array([[0.1, 0.0, 0.02], [0.3, 0.0, 0.04]])
     return FittedTrack(
-        joints,
-        rotations,
-        offsets,
-        ground,
-        np.full((len(joints), 8), load),
-        np.zeros((1, len(joints), 22)),
-        np.zeros((2, 3)),
-        np.array([True, False]),
-    )
+        joints, rotations, offsets, ground, np.full((len(joints), 8), load), np.zeros((1, len(joints), 22)),
+        np.zeros((2, 3)), np.array([True, False]),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -24,12 +24,9 @@ from steadypose.training.recipes.hgvae import train_hgvae
 from steadypose.training.weights import arrays_of
 
 SMALL = HGVAEConfig(
-    frames=12,
-    coefficients=6,
-    features=8,
-    levels=(Level(1, 4), Level(5, 3), Level(66, 2)),
+    frames=12, coefficients=6, features=8, levels=(Level(1, 4), Level(5, 3), Level(66, 2)),
     completion=CompletionConfig(patch=4, width=8, heads=2, layers=2),
-)
+)  # fmt: skip
 
 
 def awake(config: HGVAEConfig = SMALL, seed: int = 0) -> HGVAE:

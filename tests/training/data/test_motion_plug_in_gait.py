@@ -27,16 +27,11 @@ def body(knee_bend: float, elbow_bend: float) -> dict[str, Array]:
     front_x = HIP[0] + 0.24 * depth + 0.0099
     front_z = HIP[2] + 0.30 * width + 0.0109
     m: dict[str, Array] = {
-        "LASI": np.array([front_x, width / 2, front_z]),
-        "LPSI": np.array([front_x - depth, 0.05, front_z]),
-        "C7": np.array([-0.06, 0.0, 1.50]),
-        "CLAV": np.array([0.06, 0.0, 1.44]),
-        "T10": np.array([-0.10, 0.0, 1.22]),
-        "STRN": np.array([0.06, 0.0, 1.22]),
-        "LSHO": np.array([0.0, 0.18, 1.46]),
-        "LFHD": np.array([0.09, 0.07, 1.68]),
+        "LASI": np.array([front_x, width / 2, front_z]), "LPSI": np.array([front_x - depth, 0.05, front_z]),
+        "C7": np.array([-0.06, 0.0, 1.50]), "CLAV": np.array([0.06, 0.0, 1.44]), "T10": np.array([-0.10, 0.0, 1.22]),
+        "STRN": np.array([0.06, 0.0, 1.22]), "LSHO": np.array([0.0, 0.18, 1.46]), "LFHD": np.array([0.09, 0.07, 1.68]),
         "LBHD": np.array([-0.09, 0.07, 1.68]),
-    }
+    }  # fmt: skip
     lateral = np.array([0.0, 1.0, 0.0])
     knee_offset = pig.KNEE_WIDTH / 2 + pig.MARKER_RADIUS
     m["LKNE"] = KNEE + knee_offset * lateral
