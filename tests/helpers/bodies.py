@@ -55,12 +55,9 @@ def noisy(frames: int, sigma: float, speed: float = 1.0) -> np.ndarray:
 
 
 def raw(
-    stamp_ns: int,
-    bodies: dict[int, np.ndarray],
-    skeleton: str = "smpl22",
-    confidence: float = 1.0,
+    stamp_ns: int, bodies: dict[int, np.ndarray], skeleton: str = "smpl22", confidence: float = 1.0,
     pose: Pose | None = None,
-) -> PoseRaw:
+) -> PoseRaw:  # fmt: skip
     return PoseRaw(
         stamp_ns=stamp_ns, frame_id="world", source="test", skeleton=skeleton, sensor_pose=pose or Pose.identity(),
         calibrated=True, bodies=[RawBody(k, p, np.full(len(p), confidence)) for k, p in bodies.items()],

@@ -177,12 +177,9 @@ def script(
 
 @contextmanager
 def plugged(
-    messages: list[tuple[str, dai.Buffer]],
-    clock: Clock,
-    imu_to_camera: NDArray[np.float64] | None = None,
-    unplug: Callable[[dai.Pipeline, Player], None] | None = None,
-    writer: ImageWriter | None = None,
-) -> Iterator[Host]:
+    messages: list[tuple[str, dai.Buffer]], clock: Clock, imu_to_camera: NDArray[np.float64] | None = None,
+    unplug: Callable[[dai.Pipeline, Player], None] | None = None, writer: ImageWriter | None = None,
+) -> Iterator[Host]:  # fmt: skip
     """A connection over which the messages come; ``unplug`` may end it, and ``writer`` stores its images."""
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
         player = pipeline.create(Player)

@@ -12,12 +12,9 @@ SOURCES = Path(__file__).parents[2] / "src"
 
 @contextmanager
 def another_python(
-    script: str,
-    folder: Path,
-    *arguments: str,
-    python: Sequence[str] = (sys.executable,),
+    script: str, folder: Path, *arguments: str, python: Sequence[str] = (sys.executable,),
     environment: Mapping[str, str] | None = None,
-) -> Iterator[subprocess.Popen[str]]:
+) -> Iterator[subprocess.Popen[str]]:  # fmt: skip
     file = folder / f"script{len(list(folder.glob('script*.py')))}.py"
     file.write_text(script)
     environment = {**(os.environ if environment is None else environment), "PYTHONPATH": str(SOURCES)}

@@ -34,12 +34,9 @@ PARTS = [(30, {POSE_RAW}), (30, {POSE_CLEAN}), (30, {POSE_WORLD, POSE_TRUTH}), (
 
 
 def recorded(
-    directory: Path,
-    seconds: float,
-    topics: Collection[str] = EVERY,
-    change: Callable[[str, Message], object] = lambda *_: None,
-    **options,
-) -> Path:
+    directory: Path, seconds: float, topics: Collection[str] = EVERY,
+    change: Callable[[str, Message], object] = lambda *_: None, **options,
+) -> Path:  # fmt: skip
     """What is made up, each message changed."""
     stream = (it for it in messages(seconds, **options) if it[0] in topics and change(*it) is not GONE)
     return record(directory, stream)

@@ -56,14 +56,9 @@ def bones(frame: Floats) -> Floats:
 
 
 def placed(
-    joints: OccludedJoints,
-    truth: Floats,
-    seen: Floats,
-    sigma: Floats,
-    unseen: Floats,
-    completed: Floats,
+    joints: OccludedJoints, truth: Floats, seen: Floats, sigma: Floats, unseen: Floats, completed: Floats,
     completed_sigma: float,
-) -> Placed:
+) -> Placed:  # fmt: skip
     """What is said of bodies (B, 22, 3), whose bones are known, of which no joint is seen again within the delay."""
     count, again, deviations = len(seen), np.zeros(sigma.shape, dtype=bool), np.full(sigma.shape, completed_sigma)
     answer = joints.update(
