@@ -70,14 +70,11 @@ def test_scores_do_not_depend_on_where_the_sensor_stands_and_lost_markers_are_le
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "run",
-    [
-        partial(constant_velocity, delay=3, density=1.0),
-        partial(one_euro, delay=0, min_cutoff_hz=1.0, beta=2.0),
-        partial(gaussian_hampel, delay=3, sigma_s=0.05, threshold=3.0),
-    ],
-)
+@pytest.mark.parametrize("run", [
+    partial(constant_velocity, delay=3, density=1.0),
+    partial(one_euro, delay=0, min_cutoff_hz=1.0, beta=2.0),
+    partial(gaussian_hampel, delay=3, sigma_s=0.05, threshold=3.0),
+])  # fmt: skip
 def test_clips_side_by_side_are_filtered_as_if_alone(run: partial) -> None:
     clips = [clip(0, 12), clip(1, 2), clip(2, 30)]
     together, _ = run_filter(clips, run)

@@ -11,35 +11,32 @@ from steadypose.msgs.codec import DEFINITIONS
 from steadypose.msgs.types import CONTACTS, JOINTS, EventKind, Hand, JointState, Phase, Pose, RawBody, Tracking
 
 
-@pytest.mark.parametrize(
-    ("message", "field", "value", "said"),
-    [
-        (raw().bodies[0], "positions", np.zeros((17, 3)), "confidence: expected shape (17,), got shape (32,)"),
-        (raw().bodies[0], "positions", np.zeros(96), "positions: expected shape (J, 3), got shape (96,)"),
-        (raw().bodies[0], "confidence", ["sure"] * 32, "confidence: expected float32 numbers"),
-        (raw().bodies[0], "id", 2**31, "id: expected an integer of"),
-        (raw().bodies[0], "id", "1", "id: expected an integer, got '1'"),
-        (raw(), "stamp_ns", -1, "stamp_ns: expected an integer of 0 or more"),
-        (raw(), "stamp_ns", 1.5, "stamp_ns: expected an integer, got 1.5"),
-        (raw(), "stamp_ns", 2**31 * 10**9, "stamp_ns: expected an integer"),
-        (raw(), "skeleton", None, "skeleton: expected a string, got None"),
-        (raw(), "bodies", clean().bodies, "bodies: expected a list of RawBody"),
-        (raw(), "bodies", tuple(raw().bodies), "bodies: expected a list of RawBody"),
-        (clean(), "delay_frames", -1, "delay_frames: expected an integer of 0 or more"),
-        (clean().bodies[0], "positions", np.zeros((21, 3)), "positions: expected shape (22, 3), got shape (21, 3)"),
-        (clean().bodies[0], "rotations", np.zeros((22, 3)), "rotations: expected shape (22, 4)"),
-        (clean().bodies[0], "state", np.full(22, 4), "state: expected JointState values, 0 to 3"),
-        (clean().bodies[0], "state", np.full(22, 256), "state: expected JointState values"),
-        (clean().bodies[0], "anomaly", None, "anomaly: expected a number, got None"),
-        (world().bodies[0], "covariance", np.eye(3), "covariance: expected shape (6, 6)"),
-        (world().bodies[0], "contacts", np.zeros(9), "contacts: expected shape (8,)"),
-        (world().bodies[0], "tracking", 3, "tracking: expected an integer of 0 or more and under 3, got 3"),
-        (world(), "ground_plane", [0, 0, 1], "ground_plane: expected shape (4,)"),
-        (diagnostics(), "level", 4, "level: expected an integer"),
-        (diagnostics(), "values", {"rate": 30.0}, "values: expected strings"),
-        (Pose.identity(), "orientation", np.eye(3), "orientation: expected shape (4,), got shape (3, 3)"),
-    ],
-)
+@pytest.mark.parametrize(("message", "field", "value", "said"), [
+    (raw().bodies[0], "positions", np.zeros((17, 3)), "confidence: expected shape (17,), got shape (32,)"),
+    (raw().bodies[0], "positions", np.zeros(96), "positions: expected shape (J, 3), got shape (96,)"),
+    (raw().bodies[0], "confidence", ["sure"] * 32, "confidence: expected float32 numbers"),
+    (raw().bodies[0], "id", 2**31, "id: expected an integer of"),
+    (raw().bodies[0], "id", "1", "id: expected an integer, got '1'"),
+    (raw(), "stamp_ns", -1, "stamp_ns: expected an integer of 0 or more"),
+    (raw(), "stamp_ns", 1.5, "stamp_ns: expected an integer, got 1.5"),
+    (raw(), "stamp_ns", 2**31 * 10**9, "stamp_ns: expected an integer"),
+    (raw(), "skeleton", None, "skeleton: expected a string, got None"),
+    (raw(), "bodies", clean().bodies, "bodies: expected a list of RawBody"),
+    (raw(), "bodies", tuple(raw().bodies), "bodies: expected a list of RawBody"),
+    (clean(), "delay_frames", -1, "delay_frames: expected an integer of 0 or more"),
+    (clean().bodies[0], "positions", np.zeros((21, 3)), "positions: expected shape (22, 3), got shape (21, 3)"),
+    (clean().bodies[0], "rotations", np.zeros((22, 3)), "rotations: expected shape (22, 4)"),
+    (clean().bodies[0], "state", np.full(22, 4), "state: expected JointState values, 0 to 3"),
+    (clean().bodies[0], "state", np.full(22, 256), "state: expected JointState values"),
+    (clean().bodies[0], "anomaly", None, "anomaly: expected a number, got None"),
+    (world().bodies[0], "covariance", np.eye(3), "covariance: expected shape (6, 6)"),
+    (world().bodies[0], "contacts", np.zeros(9), "contacts: expected shape (8,)"),
+    (world().bodies[0], "tracking", 3, "tracking: expected an integer of 0 or more and under 3, got 3"),
+    (world(), "ground_plane", [0, 0, 1], "ground_plane: expected shape (4,)"),
+    (diagnostics(), "level", 4, "level: expected an integer"),
+    (diagnostics(), "values", {"rate": 30.0}, "values: expected strings"),
+    (Pose.identity(), "orientation", np.eye(3), "orientation: expected shape (4,), got shape (3, 3)"),
+])  # fmt: skip
 def test_a_wrong_field_is_named(message: Any, field: str, value: object, said: str):
     with pytest.raises(ValueError, match="expected") as caught:
         dataclasses.replace(message, **{field: value})

@@ -230,18 +230,15 @@ def test_without_a_library_of_tables_its_form_says_what_to_install(library: str,
         getattr(poses, f"to_{library}")()
 
 
-@pytest.mark.parametrize(
-    ("command", "extra"),
-    [
-        ("export in.npz out.glb", "export"),
-        ("retarget in.csv out.csv --urdf robot.urdf", "retarget"),
-        ("fit in.csv out.npz", "train"),
-        ("clean in.mp4 out.npz", "webcam"),
-        ("run webcam", "webcam"),
-        ("run replay --view", "view"),
-        ("clean in out --ray", "ray"),
-    ],
-)
+@pytest.mark.parametrize(("command", "extra"), [
+    ("export in.npz out.glb", "export"),
+    ("retarget in.csv out.csv --urdf robot.urdf", "retarget"),
+    ("fit in.csv out.npz", "train"),
+    ("clean in.mp4 out.npz", "webcam"),
+    ("run webcam", "webcam"),
+    ("run replay --view", "view"),
+    ("clean in out --ray", "ray"),
+])  # fmt: skip
 def test_a_missing_extra_is_said_once(command: str, extra: str, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("steadypose.nodes.extras.find_spec", lambda name: None)

@@ -58,16 +58,12 @@ def test_what_one_has_compiled_another_loads(folder: Path) -> None:
     assert entry(folder).stat().st_mode & 0o777 == 0o644
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: b"",
-        lambda data: data[:-1],
-        lambda data: bytes(len(data)),
-        lambda data: data[:-9] + b"x" + data[-8:],
-    ],
-    ids=["empty", "cut off", "zeros", "a byte"],
-)
+@pytest.mark.parametrize("damage", [
+    lambda data: b"",
+    lambda data: data[:-1],
+    lambda data: bytes(len(data)),
+    lambda data: data[:-9] + b"x" + data[-8:],
+], ids=["empty", "cut off", "zeros", "a byte"])  # fmt: skip
 def test_a_damaged_entry_is_compiled_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
     njit(cache=True)(add)(1.0)
     whole = entry(folder).read_bytes()

@@ -193,18 +193,15 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
     assert outputs == ["o/killed", "o/loose/x", "o/loose/y", "o/one", "o/table.npz"]
 
 
-@pytest.mark.parametrize(
-    ("source", "out", "more", "expected"),
-    [
-        ("in", "in/out", {}, "apart from"),
-        ("in", "used", {}, "manifest.jsonl of an earlier call"),
-        ("in", "out", {"jobs": 0}, "expected 1 or more, got 0"),
-        ("in", "out", {"jobs": 2, "ray": True}, "Ray decides"),
-        ("empty", "out", {}, "expected recordings"),
-        ("twice", "out", {}, "would both become"),
-        ("in/a.npz", "out", {"jobs": 2}, "--jobs: expected a folder"),
-    ],
-)
+@pytest.mark.parametrize(("source", "out", "more", "expected"), [
+    ("in", "in/out", {}, "apart from"),
+    ("in", "used", {}, "manifest.jsonl of an earlier call"),
+    ("in", "out", {"jobs": 0}, "expected 1 or more, got 0"),
+    ("in", "out", {"jobs": 2, "ray": True}, "Ray decides"),
+    ("empty", "out", {}, "expected recordings"),
+    ("twice", "out", {}, "would both become"),
+    ("in/a.npz", "out", {"jobs": 2}, "--jobs: expected a folder"),
+])  # fmt: skip
 def test_what_cannot_be_done_is_said(tmp_path: Path, source: str, out: str, more: dict[str, Any], expected: str):
     for name in ("in", "used", "empty", "twice"):
         (tmp_path / name).mkdir()

@@ -97,23 +97,20 @@ def test_the_grid_is_drawn_where_the_floor_is_seen() -> None:
     assert not up.any(), "no floor above the horizon"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (["board", "board.txt"], "expected a .pdf or .png"),
-        (["board", "board.pdf", "--paper", "b9"], "expected one of a4, a3, letter"),
-        (["board", "{folder}/no/board.pdf"], "to exist; make it first"),
-        (["lens", "nowhere.toml", "x"], "no launch file at nowhere.toml"),
-        (["lens", "{launch}", "{folder}/nothing"], "expected an image, a folder of images, or a video"),
-        (["lens", "{launch}", "{launch}"], "expected an image that OpenCV reads"),
-        (["floor", "{launch}", "{folder}/no.png"], "has no lens"),
-        (["floor", "{lens}", "{folder}/no.npy"], "does not exist"),
-        (["floor", "{lens}", "{folder}/bad.npy"], "cannot be read as .npy"),
-        (["floor", "{lens}", "{folder}/several.npy"], "got nothing that can be read"),
-        (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "grid.txt"], "grid.txt cannot be written"),
-        (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "{folder}/no/x.png"], "x.png cannot be written"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "complaint"), [
+    (["board", "board.txt"], "expected a .pdf or .png"),
+    (["board", "board.pdf", "--paper", "b9"], "expected one of a4, a3, letter"),
+    (["board", "{folder}/no/board.pdf"], "to exist; make it first"),
+    (["lens", "nowhere.toml", "x"], "no launch file at nowhere.toml"),
+    (["lens", "{launch}", "{folder}/nothing"], "expected an image, a folder of images, or a video"),
+    (["lens", "{launch}", "{launch}"], "expected an image that OpenCV reads"),
+    (["floor", "{launch}", "{folder}/no.png"], "has no lens"),
+    (["floor", "{lens}", "{folder}/no.npy"], "does not exist"),
+    (["floor", "{lens}", "{folder}/bad.npy"], "cannot be read as .npy"),
+    (["floor", "{lens}", "{folder}/several.npy"], "got nothing that can be read"),
+    (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "grid.txt"], "grid.txt cannot be written"),
+    (["floor", "{lens}", "{folder}/floor.npy", *UP, "--picture", "{folder}/no/x.png"], "x.png cannot be written"),
+])  # fmt: skip
 def test_what_cannot_be_done_is_said(arguments: list[str], complaint: str, tmp_path: Path, capsys) -> None:
     launch, lens = tmp_path / "kitchen.toml", tmp_path / "hall.toml"
     launch.write_text("")

@@ -58,18 +58,15 @@ def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> 
     assert off["corrected"] < 0.6 * off["plain"]
 
 
-@pytest.mark.parametrize(
-    ("change", "answer"),
-    [
-        ({"stamp_ns": 10**18 + 10**12 + np.arange(FRAMES) * 33_333_333}, "have no time in common"),
-        ({"positions": np.full((FRAMES, 22, 3), np.nan)}, "expected a person in two frames or more"),
-        ({"positions": np.ones((FRAMES, 2, 22, 3))}, "expected one person, got 2"),
-        ({"positions": waving(100), "stamp_ns": 10**18 + np.arange(100) * 33_333_333}, "expected 10 s or more"),
-        ({"positions": 1000 * waving(FRAMES)}, "are both in metres"),
-        ({"positions": waving(FRAMES)[:, ::-1]}, "in the order of their skeleton"),
-        ({"stamp_ns": 10**18 + (np.arange(FRAMES) + 12) * 33_333_333}, "the reference fits best 0.40 s earlier"),
-    ],
-)
+@pytest.mark.parametrize(("change", "answer"), [
+    ({"stamp_ns": 10**18 + 10**12 + np.arange(FRAMES) * 33_333_333}, "have no time in common"),
+    ({"positions": np.full((FRAMES, 22, 3), np.nan)}, "expected a person in two frames or more"),
+    ({"positions": np.ones((FRAMES, 2, 22, 3))}, "expected one person, got 2"),
+    ({"positions": waving(100), "stamp_ns": 10**18 + np.arange(100) * 33_333_333}, "expected 10 s or more"),
+    ({"positions": 1000 * waving(FRAMES)}, "are both in metres"),
+    ({"positions": waving(FRAMES)[:, ::-1]}, "in the order of their skeleton"),
+    ({"stamp_ns": 10**18 + (np.arange(FRAMES) + 12) * 33_333_333}, "the reference fits best 0.40 s earlier"),
+])  # fmt: skip
 def test_recordings_that_do_not_go_together_are_refused(change: dict, answer: str, tmp_path: Path, capsys) -> None:
     sensor, reference = write(tmp_path, "ann", 1.0, 0)
     good = {"positions": waving(FRAMES), "stamp_ns": 10**18 + np.arange(FRAMES) * 33_333_333, "skeleton": "smpl22"}

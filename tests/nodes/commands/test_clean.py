@@ -119,18 +119,15 @@ def test_settings_reach_the_stages(tmp_path: Path) -> None:
     assert np.abs(a - c).max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ({"settings": ("refine.enabeld=false",)}, "did you mean 'refine.enabled'"),
-        ({"settings": ("trajectory.contact=false",)}, "contacts"),
-        ({"settings": ("delay",)}, "expected section.key=value"),
-        ({"delay": 99}, "delay: expected 0 to 16"),
-        ({"settings": ("smooth.weights=nothing",)}, "no weights 'nothing'"),
-        ({"out": Path("in.npz")}, "another path"),
-        ({"source": Path("broken.npz")}, "cannot be read as .npz"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "expected"), [
+    ({"settings": ("refine.enabeld=false",)}, "did you mean 'refine.enabled'"),
+    ({"settings": ("trajectory.contact=false",)}, "contacts"),
+    ({"settings": ("delay",)}, "expected section.key=value"),
+    ({"delay": 99}, "delay: expected 0 to 16"),
+    ({"settings": ("smooth.weights=nothing",)}, "no weights 'nothing'"),
+    ({"out": Path("in.npz")}, "another path"),
+    ({"source": Path("broken.npz")}, "cannot be read as .npz"),
+])  # fmt: skip
 def test_what_cannot_be_done_is_said(tmp_path: Path, monkeypatch, arguments: dict, expected: str) -> None:
     monkeypatch.chdir(tmp_path)
     write_npz(Path("in.npz"), walked(FRAMES))

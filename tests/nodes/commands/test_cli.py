@@ -63,29 +63,26 @@ def test_what_a_terminal_would_obey_or_the_encoding_of_stdout_lacks_is_escaped(t
         assert rb"gr\xfc\xdfe/own.key" in written.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["clean", "{idle}", "{tmp}/out", "--set", "reconstruct.weights={tmp}/text.safetensors"], "as .safetensors"),
-        (["complete", "{idle}", "{tmp}/out", "--weights", "{weights}/contacts-default.safetensors"], "of completer"),
-        (["simulate", "{tmp}/out", "--manifest", "{tmp}/list.json"], "expected JSON with an object 'streams'"),
-        (["simulate", "{tmp}/out", "--manifest", "{tmp}/entry.json"], "walk: expected an object with keys"),
-        *(
-            pytest.param(*row, marks=pytest.mark.slow)
-            for row in (
-                (["fit", "{tmp}/cut.npz", "{tmp}/out.npz"], "cannot be read as .npz"),
-                (["train", "hmvae", "--data", "{tmp}/text.npz"], "that 'steadypose prepare' writes"),
-                (["train", "hmvae", "--data", "{tmp}/other.npz"], "it lacks"),
-                (["train", "hmvae", "--weights", "kinect_v2"], "expected default or research for hmvae, got kinect_v2"),
-                (["train", "mixture", "--weights", "research"], "expected default for mixture, got research"),
-                (["train", "mixture", "--data", "{tmp}"], "expected motion capture of"),
-                (["train", "correction", "--data", "{tmp}/text.npz"], "text.npz: expected an .npz archive"),
-                (["evaluate", "kinect_vicon", "--quick", "--mocap", "{tmp}"], "the folder that holds ui_prmd.npz"),
-                (["evaluate", "fidelity", "--quick", "--data", "{tmp}/other.npz"], "it lacks"),
-            )
-        ),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "expected"), [
+    (["clean", "{idle}", "{tmp}/out", "--set", "reconstruct.weights={tmp}/text.safetensors"], "as .safetensors"),
+    (["complete", "{idle}", "{tmp}/out", "--weights", "{weights}/contacts-default.safetensors"], "of completer"),
+    (["simulate", "{tmp}/out", "--manifest", "{tmp}/list.json"], "expected JSON with an object 'streams'"),
+    (["simulate", "{tmp}/out", "--manifest", "{tmp}/entry.json"], "walk: expected an object with keys"),
+    *(
+        pytest.param(*row, marks=pytest.mark.slow)
+        for row in (
+            (["fit", "{tmp}/cut.npz", "{tmp}/out.npz"], "cannot be read as .npz"),
+            (["train", "hmvae", "--data", "{tmp}/text.npz"], "that 'steadypose prepare' writes"),
+            (["train", "hmvae", "--data", "{tmp}/other.npz"], "it lacks"),
+            (["train", "hmvae", "--weights", "kinect_v2"], "expected default or research for hmvae, got kinect_v2"),
+            (["train", "mixture", "--weights", "research"], "expected default for mixture, got research"),
+            (["train", "mixture", "--data", "{tmp}"], "expected motion capture of"),
+            (["train", "correction", "--data", "{tmp}/text.npz"], "text.npz: expected an .npz archive"),
+            (["evaluate", "kinect_vicon", "--quick", "--mocap", "{tmp}"], "the folder that holds ui_prmd.npz"),
+            (["evaluate", "fidelity", "--quick", "--data", "{tmp}/other.npz"], "it lacks"),
+        )
+    ),
+])  # fmt: skip
 def test_other_files_are_refused_in_a_line(capsys, tmp_path: Path, arguments: list[str], expected: str) -> None:
     (tmp_path / "text.npz").write_text("hello")
     (tmp_path / "text.safetensors").write_text("hello, world")

@@ -119,17 +119,14 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
     assert 1e-4 < np.abs(searched - found)[10:20].max() < 0.2
 
 
-@pytest.mark.parametrize(
-    ("out", "more", "said"),
-    [
-        ("in.npz", {}, "nothing is written in place"),
-        ("no/out.npz", {}, "make it first"),
-        ("out.npz", {"picture": Path("a.txt")}, r"ending in \.png"),
-        ("out.npz", {"source": Path("mm.npz")}, "expected metres"),
-        ("out.npz", {"source": Path("none.npz")}, "expected a body with joints"),
-        ("mine.npz", {}, "--force"),
-    ],
-)
+@pytest.mark.parametrize(("out", "more", "said"), [
+    ("in.npz", {}, "nothing is written in place"),
+    ("no/out.npz", {}, "make it first"),
+    ("out.npz", {"picture": Path("a.txt")}, r"ending in \.png"),
+    ("out.npz", {"source": Path("mm.npz")}, "expected metres"),
+    ("out.npz", {"source": Path("none.npz")}, "expected a body with joints"),
+    ("mine.npz", {}, "--force"),
+])  # fmt: skip
 def test_what_cannot_be_is_said(out: str, more: dict[str, Any], said: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_npz(Path("in.npz"), waving(20))

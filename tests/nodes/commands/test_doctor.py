@@ -186,14 +186,11 @@ def test_it_needs_nothing_that_it_looks_for() -> None:
     assert done.stdout.count("BAD") >= 3
 
 
-@pytest.mark.parametrize(
-    ("checkout", "prefix", "command"),
-    [
-        (True, ".venv", "./steadypose add view"),
-        (True, "elsewhere", "pip install 'CHECKOUT[view]'"),
-        (False, "elsewhere", "pip install 'PATH/TO/CHECKOUT[view]'"),
-    ],
-)
+@pytest.mark.parametrize(("checkout", "prefix", "command"), [
+    (True, ".venv", "./steadypose add view"),
+    (True, "elsewhere", "pip install 'CHECKOUT[view]'"),
+    (False, "elsewhere", "pip install 'PATH/TO/CHECKOUT[view]'"),
+])  # fmt: skip
 def test_what_to_type_can_be_typed_here(checkout: bool, prefix: str, command: str, tmp_path: Path, monkeypatch) -> None:
     if checkout:
         (tmp_path / "pyproject.toml").touch()
@@ -232,15 +229,11 @@ def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
         return command.listen(file, console), console.export_text()
 
 
-@pytest.mark.parametrize(
-    ("frames", "status", "told"),
-    [
-        ([dataclasses.replace(raw, calibrated=False) for raw in walk(120)], 0, "no problems found"),
-        ([dataclasses.replace(raw, skeleton="smpl") for raw in walk(30)], 1, "most like 'smpl22'"),
-        ([], 1, "start the tracker"),
-    ],
-    ids=["good", "bad", "none"],
-)
+@pytest.mark.parametrize(("frames", "status", "told"), [
+    ([dataclasses.replace(raw, calibrated=False) for raw in walk(120)], 0, "no problems found"),
+    ([dataclasses.replace(raw, skeleton="smpl") for raw in walk(30)], 1, "most like 'smpl22'"),
+    ([], 1, "start the tracker"),
+], ids=["good", "bad", "none"])  # fmt: skip
 def test_what_is_wrong_with_a_tracker_is_told(file: str, frames: list[PoseRaw], status: int, told: str) -> None:
     found, text = heard(file, frames)
     assert (found, told in text) == (status, True), text

@@ -175,33 +175,27 @@ def test_a_gap_is_filled_the_rate_kept_and_a_body_placed_by_all_its_joints(tmp_p
     np.testing.assert_allclose(found.positions, motion.positions, atol=0.05 / 22 + 1e-6)
 
 
-@pytest.mark.parametrize(
-    ("stamps", "fps"),
-    [
-        ((np.arange(FRAMES) / 30).round(3), 30.0),
-        ((np.arange(FRAMES) / 120).round(3), 120.0),
-        (np.arange(FRAMES) / 29.914, 30.0),
-        (np.arange(FRAMES) / 30 + np.random.default_rng(0).uniform(0, 0.005, FRAMES), 30.0),
-        (np.arange(FRAMES) / 30 + (np.arange(FRAMES) > 9), 30.0),
-        (np.arange(FRAMES) / 27.5, 27.5),
-    ],
-)
+@pytest.mark.parametrize(("stamps", "fps"), [
+    ((np.arange(FRAMES) / 30).round(3), 30.0),
+    ((np.arange(FRAMES) / 120).round(3), 120.0),
+    (np.arange(FRAMES) / 29.914, 30.0),
+    (np.arange(FRAMES) / 30 + np.random.default_rng(0).uniform(0, 0.005, FRAMES), 30.0),
+    (np.arange(FRAMES) / 30 + (np.arange(FRAMES) > 9), 30.0),
+    (np.arange(FRAMES) / 27.5, 27.5),
+])  # fmt: skip
 def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: Floats, fps: float) -> None:
     found = steady(stamps, motion.positions, motion.rotations)
     assert found.fps == fps
     assert len(found.root) == pytest.approx((stamps[-1] - stamps[0]) * found.fps + 1, abs=1)
 
 
-@pytest.mark.parametrize(
-    ("source", "out", "more", "said"),
-    [
-        ("clean.npz", "there.glb", [], "--force"),
-        ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
-        ("raw.npz", "take.bvh", [], "clean it first"),
-        ("clean.npz", "take.csv", ["--names", "vrm"], "expected OUT to end in .bvh or .glb, got .csv"),
-        ("back.npz", "take.bvh", [], "stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"),
-    ],
-)
+@pytest.mark.parametrize(("source", "out", "more", "said"), [
+    ("clean.npz", "there.glb", [], "--force"),
+    ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
+    ("raw.npz", "take.bvh", [], "clean it first"),
+    ("clean.npz", "take.csv", ["--names", "vrm"], "expected OUT to end in .bvh or .glb, got .csv"),
+    ("back.npz", "take.bvh", [], "stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"),
+])  # fmt: skip
 def test_what_cannot_be_written_is_said(source: str, out: str, more: list[str], said: str, tmp_path, motion, capsys):
     npz(tmp_path / "clean.npz", motion)
     npz(tmp_path / "back.npz", motion, backwards=True)

@@ -121,15 +121,12 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
     assert "expected an .npz archive" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("source", "out", "says"),
-    [
-        ("nowhere.npz", "out.npz", "does not exist"),
-        ("in.npz", "keys.npz", "--force"),
-        ("empty.npz", "out.npz", "found nobody"),
-        ("keys.npz", "out", "expected an .npz"),
-    ],
-)
+@pytest.mark.parametrize(("source", "out", "says"), [
+    ("nowhere.npz", "out.npz", "does not exist"),
+    ("in.npz", "keys.npz", "--force"),
+    ("empty.npz", "out.npz", "found nobody"),
+    ("keys.npz", "out", "expected an .npz"),
+])  # fmt: skip
 def test_what_cannot_be_done_is_said(source: str, out: str, says: str, seen, pictured, tmp_path, capsys) -> None:
     write_npz(tmp_path / "empty.npz", np.full((FRAMES, 22, 3), np.nan))
     assert main(["fit", str(tmp_path / source), str(tmp_path / out)]) == 2
@@ -137,29 +134,26 @@ def test_what_cannot_be_done_is_said(source: str, out: str, says: str, seen, pic
     assert not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize(
-    ("more", "says"),
-    [
-        ({"focal": -900.0}, r"focal: expected pixels above 0, one number or two.*got array\(-900"),
-        ({"centre": [1.0]}, "centre"),
-        ({"skeleton": "nobody"}, "skeleton"),
-        ({"keypoints": np.zeros((4, 3, 2))}, "keypoints"),
-        ({"confidence": np.zeros((2, 2))}, "confidence"),
-        ({"up": "x"}, "up"),
-        ({"focal": ["long"]}, "focal: expected numbers"),
-        ({"focal": [1.0, 2.0, 3.0]}, "focal"),
-        ({"camera_height": [1.0, 2.0]}, "camera_height"),
-        ({"camera_height": -1.0}, "more than 0"),
-        ({"camera_height": np.nan}, "more than 0"),
-        ({"keypoints": np.full((FRAMES, 22, 2), np.nan)}, "expected somebody"),
-        ({"keypoints": np.full((FRAMES, 22, 2), [-0.2, 1.4])}, "expected pixels.*got -0.2 to 1.4.*multiply x by"),
-        ({"fps": 0.0}, "fps"),
-        ({"fps": 1e-9}, "fps"),
-        ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),
-        ({"stamp_ns": np.arange(FRAMES) * 10**15}, "at most in all"),
-        ({"points": np.zeros((3, 5, 3))}, "points"),
-    ],
-)
+@pytest.mark.parametrize(("more", "says"), [
+    ({"focal": -900.0}, r"focal: expected pixels above 0, one number or two.*got array\(-900"),
+    ({"centre": [1.0]}, "centre"),
+    ({"skeleton": "nobody"}, "skeleton"),
+    ({"keypoints": np.zeros((4, 3, 2))}, "keypoints"),
+    ({"confidence": np.zeros((2, 2))}, "confidence"),
+    ({"up": "x"}, "up"),
+    ({"focal": ["long"]}, "focal: expected numbers"),
+    ({"focal": [1.0, 2.0, 3.0]}, "focal"),
+    ({"camera_height": [1.0, 2.0]}, "camera_height"),
+    ({"camera_height": -1.0}, "more than 0"),
+    ({"camera_height": np.nan}, "more than 0"),
+    ({"keypoints": np.full((FRAMES, 22, 2), np.nan)}, "expected somebody"),
+    ({"keypoints": np.full((FRAMES, 22, 2), [-0.2, 1.4])}, "expected pixels.*got -0.2 to 1.4.*multiply x by"),
+    ({"fps": 0.0}, "fps"),
+    ({"fps": 1e-9}, "fps"),
+    ({"stamp_ns": np.zeros(FRAMES, dtype=np.int64)}, "stamps that grow"),
+    ({"stamp_ns": np.arange(FRAMES) * 10**15}, "at most in all"),
+    ({"points": np.zeros((3, 5, 3))}, "points"),
+])  # fmt: skip
 def test_what_is_wrong_with_key_points_is_said(more: dict, says: str, tmp_path: Path) -> None:
     path = tmp_path / "wrong.npz"
     np.savez(path, **key_points(**more))
@@ -174,17 +168,14 @@ def upside_down(share: float = 1.0) -> np.ndarray:
     return keys
 
 
-@pytest.mark.parametrize(
-    ("told", "warned"),
-    [
-        (key_points(), False),
-        (key_points(up="y"), True),
-        (key_points(up="z"), False),  # a camera that looks straight up or down
-        (key_points(keypoints=upside_down()), True),
-        (key_points(keypoints=upside_down(), up="y"), False),
-        (key_points(keypoints=upside_down(0.9)), False),  # who stands on their hands for a while
-    ],
-)
+@pytest.mark.parametrize(("told", "warned"), [
+    (key_points(), False),
+    (key_points(up="y"), True),
+    (key_points(up="z"), False),  # a camera that looks straight up or down
+    (key_points(keypoints=upside_down()), True),
+    (key_points(keypoints=upside_down(), up="y"), False),
+    (key_points(keypoints=upside_down(0.9)), False),  # who stands on their hands for a while
+])  # fmt: skip
 def test_a_picture_upside_down_is_warned_of(told: dict, warned: bool, tmp_path: Path) -> None:
     np.savez(tmp_path / "keys.npz", **told)
     problems = check_up(read_key_points(tmp_path / "keys.npz"))

@@ -137,15 +137,12 @@ def test_info_of_a_topic(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
     assert "is `steadypose run` running?" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
-        (lambda bag: echo("pose/clen"), "did you mean 'pose/clean'"),
-        (lambda bag: hz("no/where"), "no topic or recording"),
-        (lambda bag: echo(bag, topics=("pose/x",)), "no topic 'pose/x'"),
-        (lambda bag: echo(POSE_RAW, topics=(POSE_CLEAN,)), "chooses from a recording"),
-    ],
-)
+@pytest.mark.parametrize(("command", "expected"), [
+    (lambda bag: echo("pose/clen"), "did you mean 'pose/clean'"),
+    (lambda bag: hz("no/where"), "no topic or recording"),
+    (lambda bag: echo(bag, topics=("pose/x",)), "no topic 'pose/x'"),
+    (lambda bag: echo(POSE_RAW, topics=(POSE_CLEAN,)), "chooses from a recording"),
+])  # fmt: skip
 def test_what_is_not_there_is_named(recording: Path, command: Callable[[str], None], expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         command(str(recording))

@@ -50,19 +50,16 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
         assert "poses.service" not in checked.stderr, checked.stderr
 
 
-@pytest.mark.parametrize(
-    ("changed", "settings", "said"),
-    [
-        ({"command": Path("/home/a/bin/steadypose")}, {}, "in a home.*/usr/bin/python3 -m venv /opt.*pip install PATH"),
-        ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
-        ({"launch": "/tmp/a/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
-        ({}, {"transport.keys": "/home/a/keys"}, "/home/a/keys is in a home"),
-        ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
-        ({"name": "../x"}, {}, "--name: expected small letters"),
-        ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
-        ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory .*/run/poses"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "settings", "said"), [
+    ({"command": Path("/home/a/bin/steadypose")}, {}, "in a home.*/usr/bin/python3 -m venv /opt.*pip install PATH"),
+    ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
+    ({"launch": "/tmp/a/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
+    ({}, {"transport.keys": "/home/a/keys"}, "/home/a/keys is in a home"),
+    ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
+    ({"name": "../x"}, {}, "--name: expected small letters"),
+    ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
+    ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory .*/run/poses"),
+])  # fmt: skip
 def test_what_a_service_could_not_do_is_said(changed: dict[str, object], settings: dict[str, str], said: str) -> None:
     launch = Launch.read("replay", [f"{key}={value}" for key, value in settings.items()])
     with pytest.raises(LaunchError, match=said):

@@ -135,15 +135,12 @@ def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
     assert busiest_joints(track)[0] == J["left_wrist"]
 
 
-@pytest.mark.parametrize(
-    ("bodies", "output", "options", "expected"),
-    [
-        (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
-        (1, "nowhere/picture.png", {}, "no directory; make it first"),
-        (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
-        (0, "picture.png", {}, "expected at least one body, found none; `steadypose info`"),
-    ],
-)
+@pytest.mark.parametrize(("bodies", "output", "options", "expected"), [
+    (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
+    (1, "nowhere/picture.png", {}, "no directory; make it first"),
+    (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
+    (0, "picture.png", {}, "expected at least one body, found none; `steadypose info`"),
+])  # fmt: skip
 def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
     recording = recorded(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
     with pytest.raises(PlotError, match=expected):

@@ -43,68 +43,65 @@ def test_an_empty_file_is_a_launch_and_the_projects_own_are_found_by_name(write)
         assert recording.parent.resolve() == bundled("sim_data").resolve()
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("[inptu]", "did you mean 'input'"),
-        ("[input]\nrecordin = 'x'", "did you mean 'recording'"),
-        ("[input]\nrate = 'fast'", "expected float such as 1.0, got 'fast'"),
-        ("input = 3", "expected a section"),
-        ("nodes = ['priro']", "did you mean 'prior'"),
-        ("nodes = ['prior', 'prior']", "nodes names 'prior' 2 times: expected each node once"),
-        ("nodes = [['prior']]", r"nodes: expected each to be a text, got \['prior'\]"),
-        ("nodes = []", "nodes: expected one or more of pose_input, prior"),
-        ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
-        ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
-        ("[transport.endpoints]\nprior = 7101", r"\[transport\] endpoints: expected each to be a text, got 7101"),
-        (
-            "[transport.endpoints]\nprior = 'tcp://127.0.0.1:7'\nweb = 'tcp://127.0.0.1:7'",
-            r"\[transport.endpoints\] web: expected an address of its own, got tcp://127.0.0.1:7, as for prior",
-        ),
-        ("[transport]\nqueue = 0", "queue: expected 1 frame or more, got 0"),
-        ("[input]\nrate = nan", "rate: expected a finite number such as 1.0, got nan"),
-        (f"[input]\nrate = 1{400 * '0'}", "input.rate: expected an integer of at most 64 bits, got one of 1329"),
-        (f"[input.calibration]\nsize = [1, 1{400 * '0'}]", "input.calibration.size: expected an integer of at most 64"),
-        (f"[input]\nrate = 1{5000 * '0'}", "is not TOML: Exceeds the limit"),
-        ("[input]\nrate = -1.0", r"rate: expected 0 \(as fast as possible\) or more, got -1"),
-        ("[input.calibration]\nposition = ['a', 1, 2]", "position: expected each to be a float, got 'a'"),
-        ("[input.calibration]\nposition = [1.0, 2.0]", r"input\.calibration"),
-        ("[input.calibration]\nposition = [1.0, 2.0, 3.0]", r"input\.calibration"),
-        ("[input.calibration]\nposition = [0.0, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 2.0]", r"input\.calibration"),
-        ("[input.calibration]\nposition = [nan, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 1.0]", r"input\.calibration"),
-        ("[input.calibration]\nsize = [640, 360]", r"input\.calibration"),
-        ("[input.calibration]\nsize = [6, 3]\nfocal = [0.0, 5.0]\ncentre = [3.0, 1.0]", r"input\.calibration"),
-        ("[input.webcam]\nbodies = 0", "bodies: expected 1 to 64, got 0"),
-        ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
-        ("[vmc]\nport = 0", "port: expected 1 to 65535, got 0"),
-        ("[vmc]\nhost = ''", "host: expected an address"),
-        ("[web]\nport = 65536", r"\[web\] port: expected"),
-        ("[web]\nhost = ''", r"\[web\] host: expected"),
-        ("[web]\ntoken = 'short'", r"\[web\] token: expected"),
-        ("[web]\ntoken = 'with spaces, and so on'", r"\[web\] token: expected"),
-        ("[ros2]\nworld_frame = ''", "without a slash"),
-        ("[ros2]\nworld_frame = '/map'", "without a slash"),
-        ("[recorder]\nkeep_mb = 10\nsplit_mb = 10", "expected two parts or more, 20, got 10"),
-        ("[recorder]\nsync_s = -1", "sync_s: expected 0 or more"),
-        ("[input.ros2]\ntype = 'Image'", "expected MarkerArray or PoseArray, got 'Image'"),
-        ("[input.ros2]\nup = 'x'", "expected z, y or -y"),
-        ("[input.webcam]\ncamera = -1", r"\[input\.webcam\] camera: expected"),
-        ("[input.webcam]\nfield_of_view = 60.0", r"\[input\.webcam\] field_of_view, in radians: expected"),
-        ("[input.oak]\nconfidence = 50", "confidence: expected 0 to 1, got 50"),
-        ("[input.oak]\nfps = -1", "fps: expected 0 "),
-        ("[input]\nsource = 'oka'", r"source: expected .*oak.*, got 'oka' \(did you mean 'oak'"),
-        ("[input", "is not TOML"),
-        ("delay = 2", r"delay is in no section: expected \[prior\] delay"),
-        ("[input]\nloop = 'yes'", "loop: expected true or false, got 'yes'"),
-        ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya' \(did you mean 'delay'"),
-        ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup' \(did you mean 'jump'"),
-        ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
-        ("[prior]\nbias_sigma = 20", "bias_sigma: expected 0 to 1, got 20"),
-        ("[prior.gate]\nmin_confidence = 50", "min_confidence: expected 0 to 1, got 50"),
-        ("[events]\nfaces = 30", "faces: expected 0 to 3.14159, got 30"),
-        ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok' \(did you mean 'network'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "expected"), [
+    ("[inptu]", "did you mean 'input'"),
+    ("[input]\nrecordin = 'x'", "did you mean 'recording'"),
+    ("[input]\nrate = 'fast'", "expected float such as 1.0, got 'fast'"),
+    ("input = 3", "expected a section"),
+    ("nodes = ['priro']", "did you mean 'prior'"),
+    ("nodes = ['prior', 'prior']", "nodes names 'prior' 2 times: expected each node once"),
+    ("nodes = [['prior']]", r"nodes: expected each to be a text, got \['prior'\]"),
+    ("nodes = []", "nodes: expected one or more of pose_input, prior"),
+    ("[recorder]\ntopics = ['pose/row']", "did you mean 'pose/raw'"),
+    ("[transport.endpoints]\nprio = 'tcp://127.0.0.1:1'", "did you mean 'prior'"),
+    ("[transport.endpoints]\nprior = 7101", r"\[transport\] endpoints: expected each to be a text, got 7101"),
+    (
+        "[transport.endpoints]\nprior = 'tcp://127.0.0.1:7'\nweb = 'tcp://127.0.0.1:7'",
+        r"\[transport.endpoints\] web: expected an address of its own, got tcp://127.0.0.1:7, as for prior",
+    ),
+    ("[transport]\nqueue = 0", "queue: expected 1 frame or more, got 0"),
+    ("[input]\nrate = nan", "rate: expected a finite number such as 1.0, got nan"),
+    (f"[input]\nrate = 1{400 * '0'}", "input.rate: expected an integer of at most 64 bits, got one of 1329"),
+    (f"[input.calibration]\nsize = [1, 1{400 * '0'}]", "input.calibration.size: expected an integer of at most 64"),
+    (f"[input]\nrate = 1{5000 * '0'}", "is not TOML: Exceeds the limit"),
+    ("[input]\nrate = -1.0", r"rate: expected 0 \(as fast as possible\) or more, got -1"),
+    ("[input.calibration]\nposition = ['a', 1, 2]", "position: expected each to be a float, got 'a'"),
+    ("[input.calibration]\nposition = [1.0, 2.0]", r"input\.calibration"),
+    ("[input.calibration]\nposition = [1.0, 2.0, 3.0]", r"input\.calibration"),
+    ("[input.calibration]\nposition = [0.0, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 2.0]", r"input\.calibration"),
+    ("[input.calibration]\nposition = [nan, 0.0, 1.0]\norientation = [0.0, 0.0, 0.0, 1.0]", r"input\.calibration"),
+    ("[input.calibration]\nsize = [640, 360]", r"input\.calibration"),
+    ("[input.calibration]\nsize = [6, 3]\nfocal = [0.0, 5.0]\ncentre = [3.0, 1.0]", r"input\.calibration"),
+    ("[input.webcam]\nbodies = 0", "bodies: expected 1 to 64, got 0"),
+    ("[viewer]\nport = 65536", "port: expected 1 to 65535, got 65536"),
+    ("[vmc]\nport = 0", "port: expected 1 to 65535, got 0"),
+    ("[vmc]\nhost = ''", "host: expected an address"),
+    ("[web]\nport = 65536", r"\[web\] port: expected"),
+    ("[web]\nhost = ''", r"\[web\] host: expected"),
+    ("[web]\ntoken = 'short'", r"\[web\] token: expected"),
+    ("[web]\ntoken = 'with spaces, and so on'", r"\[web\] token: expected"),
+    ("[ros2]\nworld_frame = ''", "without a slash"),
+    ("[ros2]\nworld_frame = '/map'", "without a slash"),
+    ("[recorder]\nkeep_mb = 10\nsplit_mb = 10", "expected two parts or more, 20, got 10"),
+    ("[recorder]\nsync_s = -1", "sync_s: expected 0 or more"),
+    ("[input.ros2]\ntype = 'Image'", "expected MarkerArray or PoseArray, got 'Image'"),
+    ("[input.ros2]\nup = 'x'", "expected z, y or -y"),
+    ("[input.webcam]\ncamera = -1", r"\[input\.webcam\] camera: expected"),
+    ("[input.webcam]\nfield_of_view = 60.0", r"\[input\.webcam\] field_of_view, in radians: expected"),
+    ("[input.oak]\nconfidence = 50", "confidence: expected 0 to 1, got 50"),
+    ("[input.oak]\nfps = -1", "fps: expected 0 "),
+    ("[input]\nsource = 'oka'", r"source: expected .*oak.*, got 'oka' \(did you mean 'oak'"),
+    ("[input", "is not TOML"),
+    ("delay = 2", r"delay is in no section: expected \[prior\] delay"),
+    ("[input]\nloop = 'yes'", "loop: expected true or false, got 'yes'"),
+    ("[prior]\ndelya = 2", r"^\[prior\] has no setting 'delya' \(did you mean 'delay'"),
+    ("[prior.gate]\njmup = 2", r"^\[prior.gate\] has no setting 'jmup' \(did you mean 'jump'"),
+    ("[prior]\ndelay = 40", "delay: expected 0 to 16, got 40"),
+    ("[prior]\nbias_sigma = 20", "bias_sigma: expected 0 to 1, got 20"),
+    ("[prior.gate]\nmin_confidence = 50", "min_confidence: expected 0 to 1, got 50"),
+    ("[events]\nfaces = 30", "faces: expected 0 to 3.14159, got 30"),
+    ("[trajectory]\nnetwrok = true", r"^\[trajectory\] has no setting 'netwrok' \(did you mean 'network'"),
+])  # fmt: skip
 def test_what_is_wrong_is_named_with_what_would_be_right(write, text: str, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         Launch.read(write(text))
@@ -187,15 +184,12 @@ def test_who_must_hear_whom(write) -> None:
     assert live.reliable_subscribers("pose_input") == frozenset(), "a camera waits for nobody"
 
 
-@pytest.mark.parametrize(
-    ("text", "override", "former"),
-    [
-        ("[prior.bones]\nevery = 4", "prior.bones.samples=40", ["bones"]),
-        ("[prior.person]\nevery = 4", "bones.samples=40", ["bones"]),
-        ("[prior.bones]\nevery = 4", "person.samples=40", ["bones"]),
-        ("[prior.bones]\nevery = 4\nsamples = 40\n[prior.encode]", "delay=4", ["bones", "encode"]),
-    ],
-)
+@pytest.mark.parametrize(("text", "override", "former"), [
+    ("[prior.bones]\nevery = 4", "prior.bones.samples=40", ["bones"]),
+    ("[prior.person]\nevery = 4", "bones.samples=40", ["bones"]),
+    ("[prior.bones]\nevery = 4", "person.samples=40", ["bones"]),
+    ("[prior.bones]\nevery = 4\nsamples = 40\n[prior.encode]", "delay=4", ["bones", "encode"]),
+])  # fmt: skip
 def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str, former: list[str]) -> None:
     _warn_once.cache_clear()
     launch = Launch.read(write(text), [module.full_key(override, module.pipeline_sections())])
@@ -303,17 +297,14 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
     assert given == [({"port": 7}, settings.calibration)]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('plugins = {robot = "acme:ROBOT"}', "robot: acme:ROBOT cannot be imported: .*install its package"),
-        ('plugins = {robot = "nobody:ROBOT"}', "cannot be imported: No module named 'nobody'"),
-        ('plugins = {robot = "acme"}', "expected module:name, got 'acme'"),
-        ('plugins = {robot = "acme:TEXT"}', "expected a NodeDeclaration, got str"),
-        ('plugins = {prior = "acme:OTHER"}', "there is a node of that name already"),
-        ('[input]\nsource = "acme:opens"', r"\[input\] source: acme:opens cannot be imported"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ('plugins = {robot = "acme:ROBOT"}', "robot: acme:ROBOT cannot be imported: .*install its package"),
+    ('plugins = {robot = "nobody:ROBOT"}', "cannot be imported: No module named 'nobody'"),
+    ('plugins = {robot = "acme"}', "expected module:name, got 'acme'"),
+    ('plugins = {robot = "acme:TEXT"}', "expected a NodeDeclaration, got str"),
+    ('plugins = {prior = "acme:OTHER"}', "there is a node of that name already"),
+    ('[input]\nsource = "acme:opens"', r"\[input\] source: acme:opens cannot be imported"),
+])  # fmt: skip
 def test_what_is_no_plugin_is_said(package: Any, tmp_path: Path, text: str, said: str) -> None:
     package.TEXT, package.OTHER = "text", NodeDeclaration("acme:Node")
     with pytest.raises(LaunchError, match=said):

@@ -182,27 +182,23 @@ def hostile(tmp_path: Path) -> Path:
     return where
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("run", "--input", "{in}/a", *INPUT_ALONE),
-        ("clean", "{in}/a", "{out}/a.npz"),
-        ("clean", "{in}", "{out}/all", "--jobs", "2"),
-        ("info", "{in}/a"),
-        ("echo", "{in}/a"),
-        ("hz", "{in}/a"),
-        ("repair", "{in}/a", "{out}/repaired"),
-        ("plot", "{in}/a", "-o", "{out}/a.png"),
-        ("keys", "{out}/keys"),
-        ("doctor",),
-        ("install-service", "replay", "--dry-run", "--user", "root"),
-        *(
-            (name, "--help")
-            for name in ("fit", "complete", "prepare", "train", "evaluate", "simulate", "calibrate", "node")
-        ),
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("arguments", [
+    ("run", "--input", "{in}/a", *INPUT_ALONE),
+    ("clean", "{in}/a", "{out}/a.npz"),
+    ("clean", "{in}", "{out}/all", "--jobs", "2"),
+    ("info", "{in}/a"),
+    ("echo", "{in}/a"),
+    ("hz", "{in}/a"),
+    ("repair", "{in}/a", "{out}/repaired"),
+    ("plot", "{in}/a", "-o", "{out}/a.png"),
+    ("keys", "{out}/keys"),
+    ("doctor",),
+    ("install-service", "replay", "--dry-run", "--user", "root"),
+    *(
+        (name, "--help")
+        for name in ("fit", "complete", "prepare", "train", "evaluate", "simulate", "calibrate", "node")
+    ),
+], ids=" ".join)  # fmt: skip
 def test_no_command_runs_code_of_the_working_folder(arguments: tuple[str, ...], hostile: Path, tmp_path: Path, folder):
     (tmp_path / "recordings").mkdir()
     (tmp_path / "out").mkdir()

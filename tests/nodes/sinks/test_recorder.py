@@ -55,16 +55,12 @@ def test_a_disk_that_is_full_before_it_was_noticed(tmp_path: Path, recorder: Rec
         assert reader.count(POSE_RAW) > 30, "half a second before it at most is lost"
 
 
-@pytest.mark.parametrize(
-    ("stamps", "expected"),
-    [
-        ([5, 7, 6, 8], [5, 7, 7, 8]),
-        ([5, 2**61, 7, 8], [5, 5, 7, 8]),
-        ([5, 2**61, 7, 2**61, 9], [5, 5, 7, 7, 9]),
-        ([5, AHEAD_NS + 6, AHEAD_NS + 7, AHEAD_NS + 8], [5, 5, AHEAD_NS + 7, AHEAD_NS + 8]),
-    ],
-    ids=["back", "one wrong", "two wrong", "the clock was set"],
-)
+@pytest.mark.parametrize(("stamps", "expected"), [
+    ([5, 7, 6, 8], [5, 7, 7, 8]),
+    ([5, 2**61, 7, 8], [5, 5, 7, 8]),
+    ([5, 2**61, 7, 2**61, 9], [5, 5, 7, 7, 9]),
+    ([5, AHEAD_NS + 6, AHEAD_NS + 7, AHEAD_NS + 8], [5, 5, AHEAD_NS + 7, AHEAD_NS + 8]),
+], ids=["back", "one wrong", "two wrong", "the clock was set"])  # fmt: skip
 def test_log_times_follow_the_stamps_but_neither_back_nor_to_a_wrong_one(stamps: list[int], expected: list[int]):
     log_times = LogTimes()
     assert [log_times.next(POSE_RAW, stamp) for stamp in stamps] == expected

@@ -219,16 +219,13 @@ def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:
     np.testing.assert_array_equal(before.joints, after.joints)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("</robot>", "", "is no URDF"),
-        ('lower="-0.09" upper="2.88"', 'lower="2.88" upper="-0.09"', "left_knee_joint: expected lower < upper"),
-        ('"left_knee_joint" type="revolute"', '"left_knee_joint" type="continuous"', "expected revolute or prismatic"),
-        ("left_knee_link", "left_middle_link", "no link is named for left_knee: with links"),
-        ('<child link="waist_yaw_link"/>', '<child link="waist_roll_link"/>', "expected one link without a parent"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ("</robot>", "", "is no URDF"),
+    ('lower="-0.09" upper="2.88"', 'lower="2.88" upper="-0.09"', "left_knee_joint: expected lower < upper"),
+    ('"left_knee_joint" type="revolute"', '"left_knee_joint" type="continuous"', "expected revolute or prismatic"),
+    ("left_knee_link", "left_middle_link", "no link is named for left_knee: with links"),
+    ('<child link="waist_yaw_link"/>', '<child link="waist_roll_link"/>', "expected one link without a parent"),
+])  # fmt: skip
 def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, said: str) -> None:
     file = tmp_path / "robot.urdf"
     file.write_text(URDF.read_text().replace(old, new))

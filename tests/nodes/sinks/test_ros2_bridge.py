@@ -430,16 +430,13 @@ def test_standing_with_hanging_arms_is_zero() -> None:
         np.testing.assert_allclose(turned, np.eye(3), atol=1e-7, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ("number", "source", "name"),
-    [
-        (0, "", "b0"),
-        (17, "", "b11"),
-        (-1, "", "bffffffff"),
-        (2**31 - 1, "", "b7fffffff"),
-        (0, "front door__2/", "b0_front_door_2"),
-        (0, "左", "b0_u5de6"),
-    ],
-)
+@pytest.mark.parametrize(("number", "source", "name"), [
+    (0, "", "b0"),
+    (17, "", "b11"),
+    (-1, "", "bffffffff"),
+    (2**31 - 1, "", "b7fffffff"),
+    (0, "front door__2/", "b0_front_door_2"),
+    (0, "左", "b0_u5de6"),
+])  # fmt: skip
 def test_names_that_ros_takes(number: int, source: str, name: str) -> None:
     assert body_name(number, source) == name

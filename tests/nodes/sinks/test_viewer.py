@@ -177,16 +177,13 @@ def test_the_eye_follows_a_walker_and_not_a_joint_far_away(view: PoseView, log: 
     assert points(log.last("raw/focus"))[0][:2] == pytest.approx(positions[0, :2], abs=0.5)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "expected"),
-    [
-        (lambda m: setattr(m, "skeleton", "octopus8"), "unknown skeleton 'octopus8'"),
-        (lambda m: setattr(m.bodies[0], "positions", np.zeros((3, 3), np.float32)), "has 32 joints, got 3"),
-        (lambda m: setattr(m, "sensor_pose", Pose(np.zeros(3), np.zeros(4))), "norm"),
-        (lambda m: setattr(m, "source", "") or m.bodies[0].positions.fill(np.nan), ""),
-        (lambda m: m.bodies[0].positions.fill(np.inf) or m.bodies[0].confidence.fill(np.nan), ""),
-    ],
-)
+@pytest.mark.parametrize(("spoil", "expected"), [
+    (lambda m: setattr(m, "skeleton", "octopus8"), "unknown skeleton 'octopus8'"),
+    (lambda m: setattr(m.bodies[0], "positions", np.zeros((3, 3), np.float32)), "has 32 joints, got 3"),
+    (lambda m: setattr(m, "sensor_pose", Pose(np.zeros(3), np.zeros(4))), "norm"),
+    (lambda m: setattr(m, "source", "") or m.bodies[0].positions.fill(np.nan), ""),
+    (lambda m: m.bodies[0].positions.fill(np.inf) or m.bodies[0].confidence.fill(np.nan), ""),
+])  # fmt: skip
 def test_what_cannot_be_drawn_says_why(view: PoseView, spoil, expected: str) -> None:
     message = messages_on(POSE_RAW, 0.1)[0]
     spoil(message)

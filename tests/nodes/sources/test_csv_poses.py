@@ -88,16 +88,13 @@ def test_words_for_a_missing_number_leave_its_joint_unobserved(tmp_path: Path, c
     assert frame.bodies[0].confidence[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("start", "step", "expected"),
-    [
-        (0, 100 / 3, "got 0, 33, 67: these look like milliseconds; divide by 1000$"),
-        (1_750_000_000_000, 100 / 12, "got 1750000000000, 1750000000008, .*milliseconds; divide by 1000$"),
-        (0, 1e5 / 3, ".*microseconds; divide by 1000000$"),
-        (0, 1e8 / 3, ".*nanoseconds; divide by 1000000000$"),
-        (1_750_000_000 * 10**9, 1e9, ".*nanoseconds; divide by 1000000000$"),
-    ],
-)
+@pytest.mark.parametrize(("start", "step", "expected"), [
+    (0, 100 / 3, "got 0, 33, 67: these look like milliseconds; divide by 1000$"),
+    (1_750_000_000_000, 100 / 12, "got 1750000000000, 1750000000008, .*milliseconds; divide by 1000$"),
+    (0, 1e5 / 3, ".*microseconds; divide by 1000000$"),
+    (0, 1e8 / 3, ".*nanoseconds; divide by 1000000000$"),
+    (1_750_000_000 * 10**9, 1e9, ".*nanoseconds; divide by 1000000000$"),
+])  # fmt: skip
 def test_stamps_in_another_unit_are_refused_and_whole_seconds_read(tmp_path: Path, start, step, expected: str) -> None:
     lines = [f"{start + round(k * step)},{body},1,2,3" for k in range(9) for body in (1, 2)]
     with pytest.raises(CsvError, match=f"stamp: expected seconds, {expected}"):
@@ -114,27 +111,24 @@ def test_remarks_are_no_settings_and_what_seems_one_is_warned_of(tmp_path: Path,
     assert "'# unit: mm' is not used: expected '# skeleton: NAME' or '# up: AXIS'" in record.getMessage()
 
 
-@pytest.mark.parametrize(
-    ("lines", "expected"),
-    [
-        ([], "has no rows: expected a header, stamp, JOINT_x"),
-        (["time,nose_x,nose_y,nose_z"], "expected a header with a column 'stamp', in seconds; got time, nose_x"),
-        (["stamp"], "JOINT_z for each joint; got none among stamp"),
-        (["stamp;nose_x;nose_y;nose_z", "0;1;2;3"], "by commas, got ';' in 'stamp;nose_x.*save it with commas"),
-        (["stamp,Nose_X"], "for each joint; got none among stamp, Nose_X"),
-        (["stamp,nose_x,nose_y"], "missing: nose_z"),
-        (["stamp,nose_x,nose_y,nose_z,nose_x"], "each column once, got nose_x again"),
-        (["stamp,nose_x,nose_y,nose_z,tail_x,tail_y,tail_z"], "is closest, but has no tail"),
-        (["stamp,LeftWrist_x,LeftWrist_y,LeftWrist_z"], "smpl22 is closest, but has no LeftWrist .left_wrist.; rename"),
-        (["# skelton: smpl22", NOSE], "expected a line '# skeleton: NAME' .* got '# skelton: smpl"),
-        (["# skeleton: smpl", NOSE], "skeleton: expected one of smpl22, .* got 'smpl'"),
-        (["# skeleton: smpl22", NOSE], "smpl22 is closest, but has no nose"),
-        (["# up: x", NOSE, "0,1,2,3"], "up: expected one of"),
-        ([NOSE], "has a header, but no rows"),
-        ([NOSE, "a,b,c,d"], "at least one row.*row 2, column stamp: 'a'"),
-        ([NOSE, "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
-    ],
-)
+@pytest.mark.parametrize(("lines", "expected"), [
+    ([], "has no rows: expected a header, stamp, JOINT_x"),
+    (["time,nose_x,nose_y,nose_z"], "expected a header with a column 'stamp', in seconds; got time, nose_x"),
+    (["stamp"], "JOINT_z for each joint; got none among stamp"),
+    (["stamp;nose_x;nose_y;nose_z", "0;1;2;3"], "by commas, got ';' in 'stamp;nose_x.*save it with commas"),
+    (["stamp,Nose_X"], "for each joint; got none among stamp, Nose_X"),
+    (["stamp,nose_x,nose_y"], "missing: nose_z"),
+    (["stamp,nose_x,nose_y,nose_z,nose_x"], "each column once, got nose_x again"),
+    (["stamp,nose_x,nose_y,nose_z,tail_x,tail_y,tail_z"], "is closest, but has no tail"),
+    (["stamp,LeftWrist_x,LeftWrist_y,LeftWrist_z"], "smpl22 is closest, but has no LeftWrist .left_wrist.; rename"),
+    (["# skelton: smpl22", NOSE], "expected a line '# skeleton: NAME' .* got '# skelton: smpl"),
+    (["# skeleton: smpl", NOSE], "skeleton: expected one of smpl22, .* got 'smpl'"),
+    (["# skeleton: smpl22", NOSE], "smpl22 is closest, but has no nose"),
+    (["# up: x", NOSE, "0,1,2,3"], "up: expected one of"),
+    ([NOSE], "has a header, but no rows"),
+    ([NOSE, "a,b,c,d"], "at least one row.*row 2, column stamp: 'a'"),
+    ([NOSE, "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
+])  # fmt: skip
 def test_a_csv_that_is_not_poses_says_what_was_expected(tmp_path: Path, lines: list[str], expected: str) -> None:
     with pytest.raises(CsvError, match=expected):
         CsvSource(write(tmp_path / "x.csv", *lines))

@@ -107,15 +107,12 @@ def test_rate_zero_waits_for_nothing_and_the_end_is_marked_once(launch: Launch, 
     assert sent[-1][1].bodies == []
 
 
-@pytest.mark.parametrize(
-    ("seconds", "waited"),
-    [
-        pytest.param([0, 10], [10], id="a pause of ten seconds is a pause"),
-        pytest.param([1, 1, 0], [0, 0], id="stamps that repeat or step back come at once"),
-        pytest.param([0, 3600, 3601, 0, 1], [0, 1, 0, 1], id="a clock that was set is not waited for"),
-        pytest.param([0, 1, 7, 7, 3, 4, 14, 5, 6], [1, 2, 0, 0, 1, 1, 0, 1], id="nor is one stamp that is ahead"),
-    ],
-)
+@pytest.mark.parametrize(("seconds", "waited"), [
+    pytest.param([0, 10], [10], id="a pause of ten seconds is a pause"),
+    pytest.param([1, 1, 0], [0, 0], id="stamps that repeat or step back come at once"),
+    pytest.param([0, 3600, 3601, 0, 1], [0, 1, 0, 1], id="a clock that was set is not waited for"),
+    pytest.param([0, 1, 7, 7, 3, 4, 14, 5, 6], [1, 2, 0, 0, 1, 1, 0, 1], id="nor is one stamp that is ahead"),
+])  # fmt: skip
 def test_what_is_waited_for(launch: Launch, clock: VirtualClock, seconds: list[int], waited: list[int]) -> None:
     stamps = [START_NS + at * SECOND_NS for at in seconds]
     sent = play(launch, clock, Frames(stamps))
@@ -184,31 +181,28 @@ def test_recordings_that_cannot_be_played_say_why(tmp_path: Path, make_launch: M
 GOOD = {"positions": np.zeros((5, 22, 3)), "skeleton": np.array("smpl22"), "fps": np.array(30.0)}
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"positions": None}, "expected an array 'positions'"),
-        ({"skeleton": None}, "expected an array 'skeleton'"),
-        ({"skeleton": np.array("smpl23")}, "expected one of smpl22"),
-        ({"skeleton": np.array(3)}, "expected one text"),
-        ({"positions": np.zeros((5, 17, 3))}, r"\(T, 22, 3\), or \(T, bodies, 22, 3\), for smpl22, got \(5, 17, 3\)"),
-        ({"positions": np.zeros((5, 22))}, "expected shape"),
-        ({"positions": np.zeros((0, 22, 3))}, "at least one frame"),
-        ({"positions": np.full((5, 22, 3), "x")}, "expected numbers"),
-        ({"positions": np.full((5, 22, 3), None)}, "cannot be read"),
-        ({"fps": None}, "expected stamp_ns"),
-        ({"fps": np.array(0)}, "fps: expected one number above 0"),
-        ({"fps": np.array([30, 30])}, "fps: expected one number"),
-        ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can hold"),
-        ({"stamp_ns": np.arange(4)}, "stamp_ns: expected 5 integers"),
-        ({"stamp_ns": np.arange(5.0)}, "stamp_ns: expected 5 integers"),
-        ({"stamp_ns": np.arange(5) - 1}, "-1 to 3"),
-        ({"stamp_ns": np.arange(5) + 2**61}, "under 2147483648000000000, .* to 2305843009213693956"),
-        ({"stamp_ns": np.full(5, 2**63 + 5, np.uint64)}, "stamp_ns: expected 5 integers"),
-        ({"confidence": np.ones((5, 17))}, r"confidence: expected \(5, 22\)"),
-        ({"up": np.array("x")}, "up: expected one of"),
-    ],
-)
+@pytest.mark.parametrize(("change", "expected"), [
+    ({"positions": None}, "expected an array 'positions'"),
+    ({"skeleton": None}, "expected an array 'skeleton'"),
+    ({"skeleton": np.array("smpl23")}, "expected one of smpl22"),
+    ({"skeleton": np.array(3)}, "expected one text"),
+    ({"positions": np.zeros((5, 17, 3))}, r"\(T, 22, 3\), or \(T, bodies, 22, 3\), for smpl22, got \(5, 17, 3\)"),
+    ({"positions": np.zeros((5, 22))}, "expected shape"),
+    ({"positions": np.zeros((0, 22, 3))}, "at least one frame"),
+    ({"positions": np.full((5, 22, 3), "x")}, "expected numbers"),
+    ({"positions": np.full((5, 22, 3), None)}, "cannot be read"),
+    ({"fps": None}, "expected stamp_ns"),
+    ({"fps": np.array(0)}, "fps: expected one number above 0"),
+    ({"fps": np.array([30, 30])}, "fps: expected one number"),
+    ({"fps": np.array(1e-9)}, "5 frames at 1e-09 a second last longer than stamps can hold"),
+    ({"stamp_ns": np.arange(4)}, "stamp_ns: expected 5 integers"),
+    ({"stamp_ns": np.arange(5.0)}, "stamp_ns: expected 5 integers"),
+    ({"stamp_ns": np.arange(5) - 1}, "-1 to 3"),
+    ({"stamp_ns": np.arange(5) + 2**61}, "under 2147483648000000000, .* to 2305843009213693956"),
+    ({"stamp_ns": np.full(5, 2**63 + 5, np.uint64)}, "stamp_ns: expected 5 integers"),
+    ({"confidence": np.ones((5, 17))}, r"confidence: expected \(5, 22\)"),
+    ({"up": np.array("x")}, "up: expected one of"),
+])  # fmt: skip
 def test_an_npz_that_is_not_poses_says_what_was_expected(tmp_path: Path, change: dict, expected: str) -> None:
     arrays = {name: array for name, array in (GOOD | change).items() if array is not None}
     np.savez(tmp_path / "x.npz", **arrays)

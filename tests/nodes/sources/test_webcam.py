@@ -220,14 +220,11 @@ def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str,
     assert sum(clock.slept_ns) > PAUSES_S[0] * 1e9
 
 
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        (WebcamSettings(bodies=2), r"bodies: MediaPipe's own model finds one, got 2; .* such as https"),
-        (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
-        (WebcamSettings(video="gone.mp4"), "expected a video that OpenCV can read"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "expected"), [
+    (WebcamSettings(bodies=2), r"bodies: MediaPipe's own model finds one, got 2; .* such as https"),
+    (WebcamSettings(model="gone.task"), "got 'gone.task'; download one"),
+    (WebcamSettings(video="gone.mp4"), "expected a video that OpenCV can read"),
+])  # fmt: skip
 def test_settings_that_cannot_be_used_say_so(settings: WebcamSettings, expected: str) -> None:
     with pytest.raises(LaunchError, match=expected):
         camera.open_webcam(settings, SourceContext(Clock(), NOT_CALIBRATED))
@@ -338,15 +335,11 @@ def test_what_is_lost_on_the_way_from_a_camera_is_told(folder: Path, clock: Virt
     assert source.status()["dropped.lost pose/raw"] == "3"
 
 
-@pytest.mark.parametrize(
-    ("change", "cause", "words"),
-    [
-        (lambda it: dataclasses.replace(it, calibrated=False), "camera_uncalibrated", "right: not merged"),
-        (lambda it: dataclasses.replace(it, stamp_ns=it.stamp_ns - 300_000_000), "camera_late", "right: hardly merged"),
-        (lambda it: dataclasses.replace(it, source="left"), "second_publisher", "give each sensor its own name"),
-    ],
-    ids=["uncalibrated", "a clock behind", "one name"],
-)
+@pytest.mark.parametrize(("change", "cause", "words"), [
+    (lambda it: dataclasses.replace(it, calibrated=False), "camera_uncalibrated", "right: not merged"),
+    (lambda it: dataclasses.replace(it, stamp_ns=it.stamp_ns - 300_000_000), "camera_late", "right: hardly merged"),
+    (lambda it: dataclasses.replace(it, source="left"), "second_publisher", "give each sensor its own name"),
+], ids=["uncalibrated", "a clock behind", "one name"])  # fmt: skip
 def test_a_camera_not_merged_is_a_problem(folder: Path, clock: VirtualClock, change, cause: str, words: str):
     with merging(folder, clock) as (source, frames, (left, right)):
         for index, views in enumerate(zip(filmed("left", range(0)), filmed("right", range(0)), strict=True), start=1):

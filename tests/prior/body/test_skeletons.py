@@ -110,21 +110,18 @@ def test_other_names_and_means() -> None:
 CORNERS = ["left_hip", "right_hip", "left_shoulder", "right_shoulder"]
 
 
-@pytest.mark.parametrize(
-    ("description", "said"),
-    [
-        ("joints", "expected a section"),
-        ({"joints": CORNERS, "order": 1}, "got order"),
-        ({"joints": [*CORNERS, "left_hip"]}, "each once"),
-        ({"joints": "left_hip"}, "list of names"),
-        ({}, "list of names"),
-        ({"joints": CORNERS[1:]}, "expected to find left_hip"),
-        ({"joints": CORNERS, "canonical": {"nose": "left_hip"}}, "joints of smpl22"),
-        ({"joints": CORNERS, "canonical": {"head": "Top"}}, "expected names of joints, got .*Top"),
-        ({"joints": CORNERS, "canonical": {"head": []}}, "expected names of joints"),
-        ({"joints": CORNERS, "canonical": 3}, "expected a section"),
-    ],
-)
+@pytest.mark.parametrize(("description", "said"), [
+    ("joints", "expected a section"),
+    ({"joints": CORNERS, "order": 1}, "got order"),
+    ({"joints": [*CORNERS, "left_hip"]}, "each once"),
+    ({"joints": "left_hip"}, "list of names"),
+    ({}, "list of names"),
+    ({"joints": CORNERS[1:]}, "expected to find left_hip"),
+    ({"joints": CORNERS, "canonical": {"nose": "left_hip"}}, "joints of smpl22"),
+    ({"joints": CORNERS, "canonical": {"head": "Top"}}, "expected names of joints, got .*Top"),
+    ({"joints": CORNERS, "canonical": {"head": []}}, "expected names of joints"),
+    ({"joints": CORNERS, "canonical": 3}, "expected a section"),
+])  # fmt: skip
 def test_what_is_wrong_in_a_layout_is_named(description: object, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         add_layouts({"bad": description})

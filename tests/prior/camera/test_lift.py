@@ -107,16 +107,13 @@ def test_what_the_detector_doubts_or_places_outside_is_unobserved() -> None:
     assert (np.delete(sure[0], gone) == np.float32(0.9)).all()
 
 
-@pytest.mark.parametrize(
-    ("shapes", "expected"),
-    [
-        (((17, 2), (17,), (4, 4), (3, 3)), r"\(B, 17, 2\)"),
-        (((1, 17, 2), (17,), (4, 4), (3, 3)), r"\(B, 17, 2\)"),
-        (((1, 17, 2), (1, 17), (4, 4, 1), (3, 3)), r"\(H, W\)"),
-        (((1, 17, 2), (1, 17), (4, 4), (4,)), r"\(3, 3\)"),
-        (((1, 17, 2), (1, 17), (0, 4), (3, 3)), r"of a pixel or more, .* got \(0, 4\)"),
-    ],
-)
+@pytest.mark.parametrize(("shapes", "expected"), [
+    (((17, 2), (17,), (4, 4), (3, 3)), r"\(B, 17, 2\)"),
+    (((1, 17, 2), (17,), (4, 4), (3, 3)), r"\(B, 17, 2\)"),
+    (((1, 17, 2), (1, 17), (4, 4, 1), (3, 3)), r"\(H, W\)"),
+    (((1, 17, 2), (1, 17), (4, 4), (4,)), r"\(3, 3\)"),
+    (((1, 17, 2), (1, 17), (0, 4), (3, 3)), r"of a pixel or more, .* got \(0, 4\)"),
+])  # fmt: skip
 def test_shapes_that_do_not_fit_say_so(shapes: tuple[tuple[int, ...], ...], expected: str) -> None:
     keypoints, confidence, depth, intrinsics = (np.ones(shape) for shape in shapes)
     with pytest.raises(ValueError, match=expected):

@@ -66,16 +66,13 @@ def test_every_frame_with_something_missing_is_in_a_window_that_sees_the_ends_of
     assert (total[~known.all(axis=1)] > 0).all()
 
 
-@pytest.mark.parametrize(
-    "hidden",
-    [
-        (slice(40, 90), slice(None)),  # a gap
-        (slice(None), LEGS),  # a part
-        (np.arange(300) % 15 > 0, slice(None)),  # key frames
-        (slice(100, 250), slice(None)),  # longer than any window
-        (slice(0, 20), slice(None)),  # the beginning
-    ],
-)
+@pytest.mark.parametrize("hidden", [
+    (slice(40, 90), slice(None)),  # a gap
+    (slice(None), LEGS),  # a part
+    (np.arange(300) % 15 > 0, slice(None)),  # key frames
+    (slice(100, 250), slice(None)),  # longer than any window
+    (slice(0, 20), slice(None)),  # the beginning
+])  # fmt: skip
 def test_who_knows_the_motion_gives_it_back(hidden: tuple, monkeypatch) -> None:
     for share in ("WHOLE", "PART", "LOWER_ARM"):  # splines do not know it
         monkeypatch.setattr(body, share, (0.0, 1.0))
@@ -196,15 +193,12 @@ def test_doubt_of_a_joint_that_is_never_known_depends_on_what_is() -> None:
     np.testing.assert_allclose(sigma, 0.1, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("gap", "at", "drift"),
-    [
-        (slice(30, 60), 44, 0.0045 * 15 * 31 / 60),  # 15 and 16 frames from its ends
-        (slice(30, 149), 89, 0.00115 * 30**1.5),  # 60 from both
-        (slice(30, 269), 149, 0.00115 * 60**1.5),  # 120 from both
-        (slice(260, 300), 299, 0.00115 * 40**1.5),  # 40 after the last
-    ],
-)
+@pytest.mark.parametrize(("gap", "at", "drift"), [
+    (slice(30, 60), 44, 0.0045 * 15 * 31 / 60),  # 15 and 16 frames from its ends
+    (slice(30, 149), 89, 0.00115 * 30**1.5),  # 60 from both
+    (slice(30, 269), 149, 0.00115 * 60**1.5),  # 120 from both
+    (slice(260, 300), 299, 0.00115 * 40**1.5),  # 40 after the last
+])  # fmt: skip
 def test_doubt_of_a_body_on_its_way_grows_with_the_gap(gap: slice, at: int, drift: float) -> None:
     seen = waving(300)
     seen[gap] = np.nan

@@ -111,20 +111,17 @@ def first(found: list[tuple[int, EventKind, Hand, Phase]], kind: EventKind, phas
 STILL = [standing()] * 20
 
 
-@pytest.mark.parametrize(
-    ("kind", "hand", "pose", "outside", "begins", "ends", "inside"),
-    [
-        (EventKind.NEAR, Hand.NONE, standing, 2.0, 1.2, 1.4, 0.8),
-        (EventKind.FACES_SENSOR, Hand.NONE, lambda a: standing() + [0, 2.5 * np.tan(a), 0], 1, 0.6, 0.8, 0.2),
-        (EventKind.STANDS, Hand.NONE, lambda e: squatting(np.arccos(e)), 0.6, 0.85, 0.65, 0.95),
-        (EventKind.SITS, Hand.NONE, squatting, 0.3, 0.95, 0.7, 1.2),
-        (EventKind.LIES, Hand.NONE, tall, 1.0, 0.65, 0.8, 0.4),
-        (EventKind.HAND_RAISED, Hand.RIGHT, reaching, -0.2, 0.0, -0.08, 0.2),
-        (EventKind.HAND_RAISED, Hand.LEFT, lambda h: reaching(h, "left"), -0.2, 0.0, -0.08, 0.2),
-        (EventKind.POINTS, Hand.RIGHT, pointing, 1.9, 2.4, 2.15, 2.9),
-        (EventKind.POINTS, Hand.RIGHT, lambda lift: pointing(lift=lift), 0.5, 0.9, 0.9, 1.31),
-    ],
-)
+@pytest.mark.parametrize(("kind", "hand", "pose", "outside", "begins", "ends", "inside"), [
+    (EventKind.NEAR, Hand.NONE, standing, 2.0, 1.2, 1.4, 0.8),
+    (EventKind.FACES_SENSOR, Hand.NONE, lambda a: standing() + [0, 2.5 * np.tan(a), 0], 1, 0.6, 0.8, 0.2),
+    (EventKind.STANDS, Hand.NONE, lambda e: squatting(np.arccos(e)), 0.6, 0.85, 0.65, 0.95),
+    (EventKind.SITS, Hand.NONE, squatting, 0.3, 0.95, 0.7, 1.2),
+    (EventKind.LIES, Hand.NONE, tall, 1.0, 0.65, 0.8, 0.4),
+    (EventKind.HAND_RAISED, Hand.RIGHT, reaching, -0.2, 0.0, -0.08, 0.2),
+    (EventKind.HAND_RAISED, Hand.LEFT, lambda h: reaching(h, "left"), -0.2, 0.0, -0.08, 0.2),
+    (EventKind.POINTS, Hand.RIGHT, pointing, 1.9, 2.4, 2.15, 2.9),
+    (EventKind.POINTS, Hand.RIGHT, lambda lift: pointing(lift=lift), 0.5, 0.9, 0.9, 1.31),
+])  # fmt: skip
 def test_an_event_begins_alone_at_its_threshold_and_ends_at_the_laxer_one_when_crossed_for_its_hold(
     kind: EventKind, hand: Hand, pose: Callable[[float], Pose], outside: float, begins: float, ends: float,
     inside: float,

@@ -150,18 +150,15 @@ def test_a_window_is_anchored_where_the_one_before_ended() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("kernel", "residual", "expected"),
-    [
-        (huber, 2.0, 4.0),
-        (huber, 5.0, 2 * 3 * 5 - 9.0),
-        (geman_mcclure, 3.0, 4.5),
-        (geman_mcclure, 6.0, 36 / 5.0),
-        (bisquare, 3.0, 3.0),
-        (bisquare, 9.0, 3.0),
-        (bisquare, 1.5, 3.0 * (1 - 0.75**3)),
-    ],
-)
+@pytest.mark.parametrize(("kernel", "residual", "expected"), [
+    (huber, 2.0, 4.0),
+    (huber, 5.0, 2 * 3 * 5 - 9.0),
+    (geman_mcclure, 3.0, 4.5),
+    (geman_mcclure, 6.0, 36 / 5.0),
+    (bisquare, 3.0, 3.0),
+    (bisquare, 9.0, 3.0),
+    (bisquare, 1.5, 3.0 * (1 - 0.75**3)),
+])  # fmt: skip
 def test_kernels_at_a_scale_of_three(kernel, residual: float, expected: float) -> None:
     assert float(kernel(torch.tensor(residual**2, dtype=torch.float64), 3.0)) == pytest.approx(expected)
 

@@ -170,16 +170,13 @@ def test_another_skeleton_is_met_as_far_as_the_model_can(path: Path) -> None:
     assert np.degrees(steps.magnitude()).max() < 45, "no joint flips from frame to frame"
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"J_regressor": None}, "J_regressor"),
-        ({"J_regressor": np.zeros((10, 96))}, "22 or more"),
-        ({"J_regressor": np.array([{}], dtype=object)}, "numbers"),
-        ({"shapedirs": np.zeros((5, 3, 10))}, "expected"),
-        ({"kintree_table": np.zeros((2, 24), dtype=np.int64)}, "kintree_table"),
-    ],
-)
+@pytest.mark.parametrize(("change", "says"), [
+    ({"J_regressor": None}, "J_regressor"),
+    ({"J_regressor": np.zeros((10, 96))}, "22 or more"),
+    ({"J_regressor": np.array([{}], dtype=object)}, "numbers"),
+    ({"shapedirs": np.zeros((5, 3, 10))}, "expected"),
+    ({"kintree_table": np.zeros((2, 24), dtype=np.int64)}, "kintree_table"),
+])  # fmt: skip
 def test_another_file_is_refused_in_words(change: dict[str, Any], says: str, tmp_path: Path) -> None:
     arrays = {name: value for name, value in (model_arrays() | change).items() if value is not None}
     np.savez(tmp_path / "model.npz", **arrays)

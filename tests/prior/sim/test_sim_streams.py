@@ -66,16 +66,13 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     assert "File exists" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("entry", "text"),
-    [
-        ({**ENTRY, "sead": 3}, "unknown keys"),
-        ({k: v for k, v in ENTRY.items() if k != "seed"}, "expected a key 'seed'"),
-        ({**ENTRY, "script": "dance"}, "no script 'dance'; there are walk_turn"),
-        ({**ENTRY, "seconds": 0.5}, "expected seconds of 2.0 or more, got 0.5"),
-        ({**ENTRY, "camera": {**CAMERA, "zoom": 2}}, "zoom"),
-    ],
-)
+@pytest.mark.parametrize(("entry", "text"), [
+    ({**ENTRY, "sead": 3}, "unknown keys"),
+    ({k: v for k, v in ENTRY.items() if k != "seed"}, "expected a key 'seed'"),
+    ({**ENTRY, "script": "dance"}, "no script 'dance'; there are walk_turn"),
+    ({**ENTRY, "seconds": 0.5}, "expected seconds of 2.0 or more, got 0.5"),
+    ({**ENTRY, "camera": {**CAMERA, "zoom": 2}}, "zoom"),
+])  # fmt: skip
 def test_a_wrong_manifest_is_refused_with_the_reason(tmp_path: Path, entry: dict[str, object], text: str) -> None:
     with pytest.raises(ManifestError, match=text):
         read_manifest(manifest(tmp_path, short=entry))

@@ -46,51 +46,45 @@ def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObj
         read(whole)
 
 
-@pytest.mark.parametrize(
-    ("kind", "pattern", "instead", "message"),
-    [
-        ("bvh", ".*", "", "no MOTION up to the end on line 1$"),
-        ("bvh", "CHANNELS 6.*", "", "no MOTION up to the end on line 4$"),
-        ("bvh", "HIERARCHY", "", "expected HIERARCHY"),
-        ("bvh", "OFFSET 1 2 3", "OFFSET 1 two 3", "line 4: a number in the hierarchy"),
-        ("bvh", r"\}\nMOTION", "MOTION", "line 18: .* braces"),
-        ("bvh", "JOINT.*MOTION", "MOTION", "line 6: the hierarchy is cut short"),
-        ("bvh", r"HIERARCHY.*MOTION", "HIERARCHY\nMOTION", "line 1: the hierarchy is cut short"),
-        ("bvh", "Xrotation", "Wrotation", "unknown channels"),
-        ("bvh", "Frames: 1", "Frames: 2", "expected 2 frames of 12 numbers, found 12 .* on line 23; .* cut short"),
-        ("bvh", "Frames: 1", "Frames: 0", "expected 0 frames of 12 numbers, found 12 .* on line 23$"),
-        ("bvh", "Frame Time", "Frame Rate", "'Frame Time: S' after MOTION, found 'Frames: 1 Frame Rate: 0.04'"),
-        ("bvh", "Time: 0.04", "Time: 0", "frame time above zero"),
-        ("bvh", r"\d\n$", "x", "number in the motion"),
-        ("asf", "angle deg", "angle rad", "degrees"),
-        ("asf", ":hierarchy", ":other", "section ':hierarchy'"),
-        ("asf", "RX RY RZ", "RX RY RY", "six freedoms"),
-        ("asf", "root femur", "root thigh", "not known"),
-        ("asf", "length 7.0", "length long", "expected numbers"),
-        ("asf", "length 7.0", "", "bone cannot be read"),
-        ("amc", ".*", "", "expected frames"),
-        ("amc", "tibia 0", "", "cut or mixed"),
-        ("amc", "tibia", "fibula", "bone 'tibia': expected 1 angles"),
-        ("amc", "tibia 0", "fibula 0", "same place"),
-        ("amc", "tibia 40", "tibia x", "bone 'tibia'"),
-        ("amc", "root", "boot", "move 'root'"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "pattern", "instead", "message"), [
+    ("bvh", ".*", "", "no MOTION up to the end on line 1$"),
+    ("bvh", "CHANNELS 6.*", "", "no MOTION up to the end on line 4$"),
+    ("bvh", "HIERARCHY", "", "expected HIERARCHY"),
+    ("bvh", "OFFSET 1 2 3", "OFFSET 1 two 3", "line 4: a number in the hierarchy"),
+    ("bvh", r"\}\nMOTION", "MOTION", "line 18: .* braces"),
+    ("bvh", "JOINT.*MOTION", "MOTION", "line 6: the hierarchy is cut short"),
+    ("bvh", r"HIERARCHY.*MOTION", "HIERARCHY\nMOTION", "line 1: the hierarchy is cut short"),
+    ("bvh", "Xrotation", "Wrotation", "unknown channels"),
+    ("bvh", "Frames: 1", "Frames: 2", "expected 2 frames of 12 numbers, found 12 .* on line 23; .* cut short"),
+    ("bvh", "Frames: 1", "Frames: 0", "expected 0 frames of 12 numbers, found 12 .* on line 23$"),
+    ("bvh", "Frame Time", "Frame Rate", "'Frame Time: S' after MOTION, found 'Frames: 1 Frame Rate: 0.04'"),
+    ("bvh", "Time: 0.04", "Time: 0", "frame time above zero"),
+    ("bvh", r"\d\n$", "x", "number in the motion"),
+    ("asf", "angle deg", "angle rad", "degrees"),
+    ("asf", ":hierarchy", ":other", "section ':hierarchy'"),
+    ("asf", "RX RY RZ", "RX RY RY", "six freedoms"),
+    ("asf", "root femur", "root thigh", "not known"),
+    ("asf", "length 7.0", "length long", "expected numbers"),
+    ("asf", "length 7.0", "", "bone cannot be read"),
+    ("amc", ".*", "", "expected frames"),
+    ("amc", "tibia 0", "", "cut or mixed"),
+    ("amc", "tibia", "fibula", "bone 'tibia': expected 1 angles"),
+    ("amc", "tibia 0", "fibula 0", "same place"),
+    ("amc", "tibia 40", "tibia x", "bone 'tibia'"),
+    ("amc", "root", "boot", "move 'root'"),
+])  # fmt: skip
 def test_what_is_no_motion_is_refused_in_words(kind: str, pattern: str, instead: str, message: str) -> None:
     content, read = READERS[kind]
     with pytest.raises(MotionError, match=message):
         read(re.sub(pattern, instead, str(content), flags=re.S))
 
 
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        ({"trans": None}, "expected arrays trans"),
-        ({"mocap_framerate": None}, "mocap_framerate"),
-        ({"poses": np.zeros((3, 9))}, "66 or more"),
-        ({"poses": np.zeros((2, 156))}, "66 or more"),
-    ],
-)
+@pytest.mark.parametrize(("arrays", "message"), [
+    ({"trans": None}, "expected arrays trans"),
+    ({"mocap_framerate": None}, "mocap_framerate"),
+    ({"poses": np.zeros((3, 9))}, "66 or more"),
+    ({"poses": np.zeros((2, 156))}, "66 or more"),
+])  # fmt: skip
 def test_what_amass_would_not_hold_is_refused_in_words(arrays: dict[str, Any], message: str) -> None:
     given = {name: array for name, array in (AMASS | arrays).items() if array is not None}
     with pytest.raises(MotionError, match=message):

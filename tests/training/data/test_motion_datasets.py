@@ -147,21 +147,18 @@ def test_dancers_and_actors_are_told_from_the_names_of_files(tmp_path: Path) -> 
         assert [clip.name, person_of(clip.source, clip.subject), clip.action] == told
 
 
-@pytest.mark.parametrize(
-    ("name", "files", "expected"),
-    [
-        (
-            "CMU (BVH)",
-            {"006/006_07.bvh": idle_bvh(), "006/006_12.bvh": "x"},
-            [("006_07", "repeats another"), ("006/006_12.bvh", "cannot be read")],
-        ),
-        (
-            "CMU (more)",
-            {"cmu_more/first2s/39_01_1.bvh": idle_bvh(), "cmu_more/10/10_04.bvh": idle_bvh()},
-            [("10_04", "repeats another"), ("cmu_more/first2s/39_01_1.bvh", "of unknown speed")],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("name", "files", "expected"), [
+    (
+        "CMU (BVH)",
+        {"006/006_07.bvh": idle_bvh(), "006/006_12.bvh": "x"},
+        [("006_07", "repeats another"), ("006/006_12.bvh", "cannot be read")],
+    ),
+    (
+        "CMU (more)",
+        {"cmu_more/first2s/39_01_1.bvh": idle_bvh(), "cmu_more/10/10_04.bvh": idle_bvh()},
+        [("10_04", "repeats another"), ("cmu_more/first2s/39_01_1.bvh", "of unknown speed")],
+    ),
+])  # fmt: skip
 def test_repeats_and_takes_of_unknown_speed_are_left_out(tmp_path: Path, name: str, files: dict[str, str], expected):
     read = [part for s in DATA_SETS if s.name == name for part in s.read(unpack(tmp_path, files), ignore)]
     assert [(d.name, d.kind) for d in read if isinstance(d, Dropped)] == expected
