@@ -11,14 +11,8 @@ FOLDERS = ("msgs", "prior", "training", "nodes", "benchmarks")
 def tests_of_module(file: Path, root: Path) -> list[str]:
     """Return the test files that import a file's module or, if none does, a module that imports it.
 
-    If some of these are in the folder of the file's own tests (``tests/prior/fit`` for ``prior/fit``), only those.
-
-    Args:
-        file: file of the package, relative to ``root``, as are the results.
-        root: folder of the checkout.
-
-    Raises:
-        ValueError: no test imports the module, even through others.
+    If some of these are in the folder of the file's own tests (``tests/prior/fit`` for ``prior/fit``), only those. All
+    are relative to ``root``. Raises ValueError if no test imports the module, even through others.
     """
     modules = {
         ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
@@ -56,16 +50,10 @@ def _imports(path: Path) -> set[str]:
 
 
 class Part(NamedTuple):
-    """A part of a module: a function, a method, a class, a constant, or another statement.
-
-    Attributes:
-        file: relative to the checkout.
-        first, last: first and last line, from 1, including decorators.
-        ran: first line of the function that Python reports when it runs this part; 1 for the module's own statements.
-        names: names that it defines; none for a method.
-        uses: names that it mentions.
-        is_run: whether Python reports that it runs. Constants and compiled loops (njit) are not reported: a change of
-            theirs is found in the functions that use them.
+    """A part of a module, from its first to its last line (from 1): a function, a method, a class, a constant, or another
+    statement. ``ran`` is the first line of the function that Python reports when it runs this part; 1 for the module's
+    own statements. Constants and compiled loops (njit) are not reported (``is_run``): a change of theirs is found in the
+    functions that use them. ``names`` are those that it defines, none for a method; ``uses`` those that it mentions.
     """
 
     file: Path

@@ -61,14 +61,7 @@ LOOPS = ROOT / "src" / "steadypose" / "__pycache__" / "loops_of_mutants"
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change of one file.
-
-    Attributes:
-        file: relative to the checkout.
-        line: from 1.
-        old, new: source text.
-        source: the whole file, changed.
-    """
+    """One change of one file, relative to the checkout, on a line (from 1); ``source`` is the whole file, changed."""
 
     file: Path
     line: int
@@ -162,17 +155,10 @@ def copy_checkout(source: Path, target: Path) -> None:
 
 
 def passes(tests: Sequence[str], root: Path, limit_s: float | None = None, record: Path | None = None) -> bool:
-    """Return whether the tests pass on the copy of the checkout at ``root``. Tests that take too long fail.
+    """Return whether the tests (arguments of pytest) pass on the copy of the checkout at ``root`` within ``limit_s``.
 
-    Args:
-        tests: arguments of pytest.
-        root: folder of the copy.
-        limit_s: time limit, seconds; None for no limit.
-        record: file to which to write the functions that the tests ran, JSON pairs of file and first line; None if they
-            are not needed.
-
-    Raises:
-        ValueError: pytest finds no such tests.
+    ``record`` is a file for the functions that they ran, JSON pairs of file and first line. Raises ValueError if pytest
+    finds no such tests.
     """
     # fork from a process that has already imported the libraries, because importing them takes longer than most tests
     context = multiprocessing.get_context("forkserver")
@@ -214,12 +200,7 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
 
 
 class Unchanged(NamedTuple):
-    """A run of a test file on the unchanged code.
-
-    Attributes:
-        seconds: duration.
-        ran: file and first line of each function that it ran.
-    """
+    """A run of a test file on the unchanged code: file and first line of each function that it ran."""
 
     seconds: float
     ran: list[list[str | int]]
