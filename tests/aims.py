@@ -50,9 +50,10 @@ def _imports(path: Path) -> set[str]:
 
 
 class Part(NamedTuple):
-    """A part of a module, from its first to its last line (from 1): a function, a method, a class, a constant, or another
-    statement. ``ran`` is the first line of the function that Python reports when it runs this part; 1 for the module's
-    own statements. Constants and compiled loops (njit) are not reported (``is_run``): a change of theirs is found in the
+    """A part of a module, from its first to its last line (from 1): a function, class, constant or statement.
+
+    ``ran`` is the first line of the function that Python reports when it runs this part; 1 for the module's own
+    statements. Constants and compiled loops (njit) are not reported (``is_run``): a change of theirs is found in the
     functions that use them. ``names`` are those that it defines, none for a method; ``uses`` those that it mentions.
     """
 

@@ -105,9 +105,8 @@ def test_no_answer_knows_more_than_its_delay(baseline) -> None:
     whole = baseline.run(seen, STAMPS, delay, **parameters)
     other = seen.copy()
     other[25:] += 1.0
-    np.testing.assert_array_equal(
-        whole[: 25 - delay], baseline.run(other, STAMPS, delay, **parameters)[: 25 - delay], err_msg=baseline.name
-    )
+    expected = baseline.run(other, STAMPS, delay, **parameters)[: 25 - delay]
+    np.testing.assert_array_equal(whole[: 25 - delay], expected, err_msg=baseline.name)
     assert whole.shape == seen.shape
 
 

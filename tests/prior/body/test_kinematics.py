@@ -69,6 +69,5 @@ def test_rotation_vectors_are_scipys() -> None:
     vectors[0], vectors[1] = 0.0, 1e-7
     turned = kinematics.from_rotation_vectors(vectors)
     np.testing.assert_allclose(turned, Rotation.from_rotvec(vectors).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(
-        kinematics.to_rotation_vectors(turned), Rotation.from_matrix(turned).as_rotvec(), atol=1e-9
-    )
+    expected = Rotation.from_matrix(turned).as_rotvec()
+    np.testing.assert_allclose(kinematics.to_rotation_vectors(turned), expected, atol=1e-9)

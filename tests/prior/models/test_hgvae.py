@@ -83,9 +83,8 @@ def test_the_guess_of_a_hidden_joint_goes_with_the_one_it_hangs_from() -> None:
     seen = window.copy()
     seen[10:, foot] = np.nan
     guess = from_tracks(to_tracks(seen, 1.0).x, to_tracks(seen, 1.0), 1.0)
-    np.testing.assert_allclose(
-        guess[10:, foot] - window[10:, ankle], np.tile(window[9, foot] - window[9, ankle], (20, 1))
-    )
+    expected = np.tile(window[9, foot] - window[9, ankle], (20, 1))
+    np.testing.assert_allclose(guess[10:, foot] - window[10:, ankle], expected)
     unseen = np.zeros((66, 4))
     unseen[3 * ankle : 3 * ankle + 3] = 0.5
     unseen[3 * foot : 3 * foot + 3] = np.nan

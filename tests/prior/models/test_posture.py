@@ -141,9 +141,8 @@ def test_the_covariance_of_the_root_is_honest(posture: LivePosture, joints: np.n
 def test_a_perfect_root_is_said_to_be_as_sure_as_any(posture: LivePosture, joints: np.ndarray) -> None:
     root = _root(posture, joints, 0.0)
     covariance = RootCovariance()(joints, np.zeros((BODIES, 22)), root)
-    np.testing.assert_allclose(
-        covariance, np.broadcast_to(stage.LEAST_SIGMA**2 * np.eye(3), covariance.shape), atol=1e-6
-    )
+    expected = np.broadcast_to(stage.LEAST_SIGMA**2 * np.eye(3), covariance.shape)
+    np.testing.assert_allclose(covariance, expected, atol=1e-6)
 
 
 def test_a_rigid_pelvis_is_turned_as_its_bones_are() -> None:
