@@ -17,6 +17,7 @@ from steadypose.msgs.types import Message, PoseWorld, Tracking, WorldBody
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import check_host_and_port
+from steadypose.nodes.sinks.drawing import ahead
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.body.skeleton import PARENTS, VRM
@@ -110,19 +111,21 @@ class VmcSettings(DatagramSettings):
 
 
 def unity(body: WorldBody) -> tuple[Floats, Floats]:
-    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward.
+    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward, whither looks
+    who faces a camera.
 
     Unity's axes are left-handed, so positions are mirrored, and the sense of rotations is reversed.
 
     Returns:
         (22, 3) metres, the hips in the world; and (22, 4) xyzw.
     """
-    rotations = np.asarray(body.rotations, dtype=np.float64)
+    rotations = np.array(body.rotations, dtype=np.float64)
     world = global_rotations(rotation_matrices(rotations))
     positions = np.asarray(body.positions, dtype=np.float64)
     parents = list(PARENTS[1:])
     local = (positions[1:] - positions[parents])[:, None] @ world[parents]
-    places = np.concatenate([positions[:1], local[:, 0]])
+    root, rotations[0] = ahead(positions[0], rotations[0])
+    places = np.concatenate([root[None], local[:, 0]])
     return places[:, [1, 2, 0]] * (-1.0, 1.0, 1.0), rotations[:, [1, 2, 0, 3]] * (1.0, -1.0, -1.0, 1.0)
 
 

@@ -72,6 +72,16 @@ def to_world(positions: NDArray[np.floating], sensor_pose: Pose) -> NDArray[np.f
     return (rotation.apply(flat) + sensor_pose.position).reshape(positions.shape)
 
 
+_QUARTER = Rotation.from_euler("z", 90.0, degrees=True)
+
+
+def ahead(root: NDArray[np.floating], rotations: NDArray[np.floating]) -> tuple[NDArray[np.float64], ...]:
+    """Turn a body's root (..., 3) and root rotation (..., 4) xyzw about the vertical, for programs of animation: who
+    faces a camera, which looks along y, then faces x, their front; and a y-up file is written as it was read.
+    """
+    return _QUARTER.apply(root), (_QUARTER * Rotation.from_quat(rotations)).as_quat()
+
+
 def facing(positions: NDArray[np.floating]) -> NDArray[np.float64] | None:
     """(3,) horizontal unit vector in which the hips and shoulders of (22, 3) world joints face; None if unobserved."""
     across = np.nansum(

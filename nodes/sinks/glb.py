@@ -54,7 +54,7 @@ def to_vrma(motion: BodyMotion) -> bytes:
 
 
 def _file(motion: BodyMotion, names: Sequence[str], at_rest: bool) -> bytes:
-    file = _Glb()
+    file, motion = _Glb(), motion.ahead()
     offsets = motion.offsets @ Y_UP.T
     rest = np.zeros((22, 3))
     for joint, parent in enumerate(PARENTS[1:], start=1):

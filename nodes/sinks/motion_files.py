@@ -1,14 +1,14 @@
 """Writes one cleaned body at a constant rate, with constant bone lengths, as BVH, CSV or TRC.
 
-BVH is in centimetres, y up, with a T pose that faces +z as rest pose. CSV is as `nodes.sources.recording` reads it. TRC
-is as OpenSim reads it.
+BVH is in centimetres, y up, with a T pose that faces +z as rest pose, as does who faces a camera. CSV is as
+`nodes.sources.recording` reads it. TRC is as OpenSim reads it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from steadypose.msgs.recording import RecordingReader
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseWorld
+from steadypose.nodes.sinks.drawing import ahead
 from steadypose.nodes.sources.npz import read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import forward_kinematics, global_rotations, rigid_alignment
@@ -44,6 +45,12 @@ class BodyMotion:
     """(22, 3) metres, each joint in its parent's frame"""
     start_s: float = 0.0
     """stamp of the first frame, seconds"""
+
+    def ahead(self) -> BodyMotion:
+        """The motion with its world turned for programs of animation (`drawing.ahead`)."""
+        root, rotations = self.root, self.rotations.copy()
+        root, rotations[:, 0] = ahead(root, rotations[:, 0])
+        return replace(self, root=root, rotations=rotations)
 
     @property
     def positions(self) -> Floats:
@@ -182,6 +189,7 @@ ENDS = {
 
 def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
     """The content of a BVH file; ``names`` are those of the 22 joints."""
+    motion = motion.ahead()
     lines = ["HIERARCHY"]
     order: list[int] = []
 
@@ -238,7 +246,7 @@ def to_csv(motion: BodyMotion) -> bytes:
 
 def to_trc(motion: BodyMotion) -> bytes:
     """The content of a TRC file with markers at the joints: millimetres, y up."""
-    rows = (MILLIMETRES * motion.positions @ Y_UP.T).reshape(len(motion.root), -1)
+    rows = (MILLIMETRES * motion.ahead().positions @ Y_UP.T).reshape(len(motion.root), -1)
     frames, rate = len(rows), f"{motion.fps:g}"
     header = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame",
               "OrigNumFrames")  # fmt: skip

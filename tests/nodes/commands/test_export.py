@@ -16,10 +16,11 @@ from steadypose.msgs.types import JOINTS, PoseRaw, PoseWorld, WorldBody
 from steadypose.nodes.cli import main
 from steadypose.nodes.sinks import motion_files
 from steadypose.nodes.sinks.glb import to_glb
-from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion, ExportError, read_motion, steady
+from steadypose.nodes.sinks.motion_files import BodyMotion, ExportError, read_motion, steady
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS
+from steadypose.prior.mocap.clip import TO_Z_UP
 from steadypose.prior.mocap.files import read_motion as read_file
 
 FRAMES = 40
@@ -65,7 +66,7 @@ def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotio
     path = tmp_path / "take.bvh"
     path.write_bytes(motion_files.to_bvh(motion))
     root = bvhio.readAsHierarchy(str(path))
-    expected = 100 * motion.positions @ Y_UP.T
+    expected = 100 * motion.positions @ TO_Z_UP["y"]
     for frame in (0, 17, FRAMES - 1):
         root.loadPose(frame)
         for joint, _, _ in root.layout():
@@ -74,7 +75,7 @@ def test_bvh_is_read_by_bvhio_and_by_ourselves(tmp_path: Path, motion: BodyMotio
                 np.testing.assert_allclose(at, expected[frame, JOINTS.index(joint.Name)], atol=2e-3, err_msg=joint.Name)
     fps, body = read_file("take.bvh", path.read_bytes())
     assert fps == pytest.approx(30.0)
-    np.testing.assert_allclose(body, motion.positions[..., [1, 0, 2]] * [1, -1, 1], atol=1e-5)
+    np.testing.assert_allclose(body, motion.positions, atol=1e-5)
 
 
 def test_trc_and_csv_are_read_by_pandas(tmp_path: Path, motion: BodyMotion) -> None:
@@ -86,7 +87,7 @@ def test_trc_and_csv_are_read_by_pandas(tmp_path: Path, motion: BodyMotion) -> N
     assert markers.tolist() == list(JOINTS)
     table = pandas.read_csv(path, sep="\t", skiprows=6, header=None).to_numpy()
     np.testing.assert_allclose(table[:, 1], np.arange(FRAMES) / 30, atol=1e-6)
-    np.testing.assert_allclose(table[:, 2:].reshape(FRAMES, 22, 3), 1000 * motion.positions @ Y_UP.T, atol=1e-3)
+    np.testing.assert_allclose(table[:, 2:].reshape(FRAMES, 22, 3), 1000 * motion.positions @ TO_Z_UP["y"], atol=1e-3)
 
     path = tmp_path / "take.csv"
     path.write_bytes(motion_files.to_csv(motion))
@@ -110,7 +111,7 @@ def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, mot
         start = file.bufferViews[told.bufferView].byteOffset or 0
         return np.frombuffer(file.binary_blob(), kind, told.count * width, start).reshape(-1, width)
 
-    expected = motion.positions @ Y_UP.T
+    expected = motion.positions @ TO_Z_UP["y"]
     frame = 17
     at = {node.name: np.array(node.translation) for node in file.nodes[:22]}
     turn = {}
@@ -212,9 +213,7 @@ def test_tables_come_back_as_they_went(tmp_path: Path, motion: BodyMotion, suffi
     assert main(["export", str(source), str(out)]) == 0
     frames = [message for _, message in open_recording(out) if isinstance(message, PoseRaw)]
     found = np.stack([frame.bodies[0].positions for frame in frames])
-    # What is y up is turned about x to z up: its front is then -y.
-    expected = motion.positions if suffix == ".csv" else motion.positions[..., [1, 0, 2]] * [1, -1, 1]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(found, motion.positions, atol=1e-5)
     assert frames[-1].stamp_ns == pytest.approx((FRAMES - 1) / 30 * 1e9, abs=1e6)
 
 
@@ -245,7 +244,6 @@ def test_joints_have_the_names_of_the_rig_that_is_asked_for(tmp_path: Path, moti
     assert elbow in {node.name for node in file.nodes}
     if names == "mixamo":  # and they are read again, as any rig of that kind
         read = read_file("take.bvh", (tmp_path / "take.bvh").read_bytes())
-        ahead_is_y = motion.positions[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
-        off = np.linalg.norm(read.positions - ahead_is_y, axis=-1).max(axis=0)
+        off = np.linalg.norm(read.positions - motion.positions, axis=-1).max(axis=0)
         # their place in other rigs is that of SMPL
         assert {JOINTS[joint] for joint in np.flatnonzero(off > 1e-6)} <= {"left_collar", "right_collar"}

@@ -49,7 +49,7 @@ def test_the_bones_give_the_body_back_in_unitys_axes_and_nobody_is_said_too() ->
         placed[joint] = place if parent < 0 else placed[parent] + turned[parent].apply(place)
         turned[joint] = turn if parent < 0 else turned[parent] * turn
     right, up, forward = placed.T
-    np.testing.assert_allclose(np.stack([forward, -right, up], axis=1), body.positions, atol=1e-4)
+    np.testing.assert_allclose(np.stack([-right, -forward, up], axis=1), body.positions, atol=1e-4)
     assert messages(osc_bundles(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
 
 
