@@ -89,10 +89,13 @@ def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion
     (T, 22, 3) metres, world, and local rotations (T, 22, 4) xyzw. The body is placed by the mean of all its joints: its
     bones do not fit the positions, and placed by the pelvis, it would be off by the pelvis' error as a whole.
     """
-    fps = _rate(stamps_s)
+    rate = _rate(stamps_s)
+    nearest = min(COMMON_HZ, key=lambda common: abs(common - rate))
+    fps = nearest if abs(nearest - rate) <= SAME * nearest else float(np.round(rate, 3))
     body = BodyMotion(fps, positions[:, 0], rotations, _bones(positions, rotations))
     placed = body.root + (positions - body.positions).mean(axis=1)
-    at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * fps + 0.01) + 1) / fps
+    rate = rate if abs(fps - rate) <= ROUNDED * fps else fps
+    at = stamps_s[0] + np.arange(int((stamps_s[-1] - stamps_s[0]) * rate + 0.01) + 1) / rate
     at = at.clip(max=stamps_s[-1])
     turned = np.stack([Slerp(stamps_s, Rotation.from_quat(rotations[:, j]))(at).as_quat() for j in range(22)], axis=1)
     root = np.stack([np.interp(at, stamps_s, placed[:, axis]) for axis in range(3)], axis=1)
@@ -104,14 +107,14 @@ COMMON_HZ = (10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 7
 """Frame rates of cameras and motion capture, Hz."""
 SAME = 0.01
 """Largest deviation from a common rate that counts as rounding or jitter, ratio."""
+ROUNDED = 1e-4
+"""Largest one by which a file's frame time is rounded, such as 0.008333 s: frames then are the input's own."""
 
 
 def _rate(stamps_s: Floats) -> float:
-    """The frame rate of stamps (T,) in seconds, Hz: of the mean step without gaps, because stamps may be rounded."""
+    """The rate of stamps (T,) in seconds, Hz: of the mean step without gaps, because stamps may be rounded."""
     steps = np.diff(stamps_s)
-    rate = 1.0 / float(steps[steps < 1.5 * np.median(steps)].mean())
-    nearest = min(COMMON_HZ, key=lambda common: abs(common - rate))
-    return nearest if abs(nearest - rate) <= SAME * nearest else float(np.round(rate, 3))
+    return 1.0 / float(steps[steps < 1.5 * np.median(steps)].mean())
 
 
 def _bones(positions: Floats, rotations: Floats) -> Floats:

@@ -190,6 +190,12 @@ def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: F
     assert len(found.root) == pytest.approx((stamps[-1] - stamps[0]) * found.fps + 1, abs=1)
 
 
+def test_a_rounded_frame_time_costs_no_frame(motion: BodyMotion) -> None:
+    whole, turned = (np.tile(part, (20, 1, 1)) for part in (motion.positions, motion.rotations))
+    found = steady(0.008333 * np.arange(len(whole)), whole, turned)
+    assert (found.fps, len(found.root)) == (120.0, len(whole))
+
+
 @pytest.mark.parametrize(("source", "out", "more", "said"), [
     ("clean.npz", "there.glb", [], "--force"),
     ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
