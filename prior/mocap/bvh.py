@@ -3,7 +3,8 @@
 This is our own reader; `docs/results.md`, "Importers", compares packages. The format does not define what a position
 channel means. In the original definition, it is added to the joint's OFFSET. Exporters that give every joint position
 channels write the whole offset into them, so there it replaces the OFFSET. Here it is added at a root, where the two
-differ only by a constant shift of the world, and replaces the OFFSET elsewhere.
+differ only by a constant shift of the world (`prior.mocap.files` tells which has the feet on the floor), and replaces
+the OFFSET elsewhere.
 """
 
 from __future__ import annotations
@@ -181,9 +182,14 @@ def _hierarchy(text: str) -> list[_Node]:
     except (StopIteration, IndexError) as error:
         raise MotionError(f"line {number}: the hierarchy is cut short or its braces do not match") from error
     except ValueError as error:
-        what = error if isinstance(error, MotionError) else f"a number in the hierarchy cannot be read: {error}"
+        what = error if isinstance(error, MotionError) else _unread("hierarchy", error)
         raise MotionError(f"line {number}: {what}") from error
     return nodes
+
+
+def _unread(part: str, error: ValueError) -> str:
+    comma = "; write decimal points, not commas" if "," in str(error) else ""
+    return f"a number in the {part} cannot be read: {error}{comma}"
 
 
 def _numbers(text: str) -> NDArray[np.float64]:
@@ -202,7 +208,7 @@ def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], f
         frames, seconds = int(words[1]), float(words[4])
         values = _numbers(words[5]) if len(words) > 5 else np.empty(0)
     except ValueError as error:
-        raise MotionError(f"a number in the motion cannot be read: {error}") from error
+        raise MotionError(_unread("motion", error)) from error
     if seconds <= 0:
         raise MotionError(f"expected a frame time above zero, found {seconds}")
     if len(values) != frames * channels:

@@ -124,8 +124,15 @@ def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str
 def _bvh(content: bytes, description: Description) -> _Read:
     bvh = read_bvh(content.decode("utf-8-sig", "replace"))
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
-    positions = bvh.positions(rig.lost_bones)[:, [bvh.joints.index(j) for j in rig.skeleton.joints]]
-    return bvh.fps, rig.skeleton, positions * (description.metres or rig.metres), rig.up
+    used = [bvh.joints.index(joint) for joint in rig.skeleton.joints]
+    metres = description.metres or rig.metres
+    positions = metres * bvh.positions(rig.lost_bones)[:, used]
+    up = description.up or rig.up or up_axis(to_canonical(rig.skeleton, positions)[0])
+    # many programs write a root's OFFSET into its channels too; added to them, it lifts the body off the floor at 0
+    root = metres * bvh.offsets[Tree(bvh.joints, bvh.parents, bvh.offsets).path(used[0])[0]]
+    lowest = float((positions @ TO_Z_UP[up][2]).min())
+    lifted = abs(lowest - root @ TO_Z_UP[up][2]) < abs(lowest)
+    return bvh.fps, rig.skeleton, positions - root * lifted, up
 
 
 def _amass(content: bytes, _: Description) -> _Read:

@@ -284,6 +284,19 @@ def test_what_is_no_body_is_refused_in_words() -> None:
     headless = [j for j in FAMILIES["LAFAN1"].joints() if j.name not in ("Neck", "Head")]
     with pytest.raises(MotionError, match="neck and head above 'Spine2'"):
         recognise(as_tree(headless))
+    one = FAMILIES["LAFAN1"].joints()
+    other = [replace(j, name=f"B{j.name}", parent=j.parent and f"B{j.parent}") for j in one]
+    with pytest.raises(MotionError, match="one body, got limbs below the roots Hips and BHips: export each"):
+        recognise(as_tree([*one, *other]))
+
+
+def test_an_offset_that_the_roots_channels_contain_too_does_not_lift_the_body() -> None:
+    content = write_bvh(FAMILIES["LAFAN1"].joints(), np.array([50.0, 90.0, -100.0]), 30.0)
+    doubled = content.replace(b"OFFSET 0.000000 0.000000 0.000000", b"OFFSET 50 90 -100", 1)
+    moved = content.replace(b"OFFSET 0.000000 0.000000 0.000000", b"OFFSET 0 85 0", 1).replace(b" 90.0", b" 5.0")
+    for same in (doubled, moved):
+        assert same != content
+        np.testing.assert_allclose(read_motion("x.bvh", same)[1], read_motion("x.bvh", content)[1], atol=1e-9)
 
 
 def test_sides_are_told_by_names_that_stay_names() -> None:

@@ -10,6 +10,7 @@ from tests.helpers.motion_files import AMC, ASF, bvh_text, npz
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, J
 from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
+from steadypose.prior.mocap.clip import MotionError
 from steadypose.prior.mocap.files import read_motion
 from steadypose.training.data.cmu import read_amc, read_asf, read_expmap
 
@@ -52,6 +53,12 @@ def test_a_long_bvh_takes_no_more_memory_than_a_few_copies_of_its_text_and_of_it
     tracemalloc.stop()
     assert read < 7 * len(text)  # of all words at once: 9.8
     assert computed < 2 * (bvh.values.nbytes + 2 * positions.nbytes)  # of all rotations at once: 3.3
+
+
+def test_decimal_commas_are_named() -> None:
+    for text in (bvh_text().replace("0.3", "0,3"), bvh_text(frames=[[0.5] * 12]).replace("0.5", "0,5")):
+        with pytest.raises(MotionError, match=r"cannot be read: .*; write decimal points, not commas"):
+            read_bvh(text)
 
 
 def test_a_bone_that_the_converter_lost_is_put_back_only_where_it_is_lost() -> None:
