@@ -254,6 +254,9 @@ def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
             f"got {', '.join(tree.joints[:8])}...; say with {BY_RIG} which joints are which"
         )
     legs, arms = sorted(limbs, key=lambda limb: len(tree.path(limb.trunk)))
+    roots = [tree.joints[tree.path(limb.trunk)[0]] for limb in (legs, arms)]
+    if roots[0] != roots[1] or tree.joints.count(roots[0]) > 1:
+        raise MotionError(f"expected one body, got limbs below the roots {' and '.join(roots)}: export each body alone")
     return legs, arms
 
 
