@@ -155,17 +155,6 @@ def test_a_recording_gives_raw_and_truth_and_not_what_was_made_of_them(tmp_path:
     assert list(source) == [(POSE_TRUTH, truth), *((POSE_RAW, frame) for frame in frames)]
 
 
-def test_a_truncated_recording_is_played_as_far_as_it_goes(tmp_path: Path) -> None:
-    path = record(tmp_path / "r", walk(300))
-    file = next(path.glob("*.mcap"))
-    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    source = open_recording(path)
-    played = list(source)
-    assert 100 < len(played) < 200
-    assert played == [(POSE_RAW, frame) for frame in walk(300)[: len(played)]]
-    assert source.refused.total() > 0
-
-
 def test_recordings_that_cannot_be_played_say_why(tmp_path: Path, make_launch: MakeLaunch) -> None:
     with pytest.raises(LaunchError, match="does not exist"):
         open_recording(tmp_path / "nowhere")
