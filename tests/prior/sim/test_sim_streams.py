@@ -78,10 +78,6 @@ def test_a_wrong_manifest_is_refused_with_the_reason(tmp_path: Path, entry: dict
         read_manifest(manifest(tmp_path, short=entry))
 
 
-# ---------------------------------------------------------------------------------------------------------------
-# The bundled streams
-
-
 @pytest.mark.parametrize("name", STREAMS)
 def test_a_bundled_stream_is_what_the_manifest_says(name: str) -> None:
     stream = STREAMS[name]
