@@ -65,6 +65,8 @@ def evaluate(
         require_committed(out)
     one_thread()
     console, wrong = Console(), list[str]()
+    if not data.is_file() and study not in (*NO_SPLIT, *SYSTEMS):
+        console.print(f"{data} does not exist: the people are simulated", highlight=False, markup=False, soft_wrap=True)
     with Progress(console=console, transient=True) as progress:
         bench = Bench(quick=quick, mocap=mocap, data=data, progress=progress, split=split)
         for name in STUDIES if study == "all" else (study,):

@@ -209,7 +209,9 @@ def test_all_is_every_protocol_in_turn_without_what_is_not_here(tmp_path: Path, 
     evaluate("all", quick=True, data=tmp_path / "nowhere.npz")
     assert len(ran) == len(STUDIES) - len(SENSORS) - len(PREPARED)
     assert len(set(map(id, ran))) == 1  # what is trained for one protocol serves the others
-    assert "kinect_vicon: left out" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "kinect_vicon: left out" in said
+    assert "nowhere.npz does not exist: the people are simulated" in said
 
 
 def test_every_reading_of_the_test_split_is_logged_and_no_other(tmp_path: Path, monkeypatch) -> None:
