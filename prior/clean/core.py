@@ -76,7 +76,7 @@ class CleanCore:
         self._imputes = impute
         self.fuse = Fuse(settings.fuse, slots)
         self._posture = Posture(settings.posture) if settings.posture.enabled else None
-        self._steady = Steady(slots) if settings.steady.enabled else None
+        self._steady = Steady(slots, delay) if settings.steady.enabled else None
         self._orient = Orient(settings.orient, slots) if settings.orient.enabled else None
         self._history = History(max(delay + 1, self._reconstruct.frames if self._reconstruct else 0), slots)
         stages = (
@@ -184,7 +184,7 @@ class CleanCore:
             noise = np.hypot(newest.gated.jitter, newest.bias.bias_sigma)
             estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
         if self._steady:
-            estimate = self._steady.update(estimate, smoothed.step)
+            estimate = self._steady.update(estimate, smoothed.step, self._history.positions[at], newest.lasting)
         estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
         mixed = mix(estimate, self._history.unseen_s[at])
         if self._orient:
