@@ -116,7 +116,7 @@ class CleanCore:
         if self._reconstruct:
             windows = self._reconstruct.update(self._history, present, person, bias_sigma)
         if self._denoise:
-            smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter)
+            smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter, bias_sigma)
         bias = self._bias.update(smoothed, person, gated.jitter)
         left_out = self._depth_error.update(smoothed, self._smooth.white)
         person = self._person.update(smoothed, bias.bias_sigma, present)
@@ -142,7 +142,7 @@ class CleanCore:
             return []
         held = self._smooth.flush()
         if self._denoise:
-            held = self._denoise.flush(held, self._history, newest.gated.jitter)
+            held = self._denoise.flush(held, self._history, newest.gated.jitter, newest.bias.bias_sigma)
         return [self._fused(smoothed, newest, len(held) - 1 - k) for k, smoothed in enumerate(held)]
 
     def forget(self, slot: Bools) -> None:

@@ -92,18 +92,26 @@ class Denoise:
         self._apart[slot] = self._frames[slot] = 0.0
 
     def update(
-        self, windows: BodyWindows | None, smoothed: Smoothed | None, history: History, jitter: Floats
+        self,
+        windows: BodyWindows | None,
+        smoothed: Smoothed | None,
+        history: History,
+        jitter: Floats,
+        bias_sigma: Floats,
     ) -> Smoothed | None:
         """Add HG-VAE's reconstruction of the newest windows, if any, and denoise the smoother's newest estimate,
-        ``delay_frames`` before the newest frame, if any. ``jitter`` (S,) metres along an axis is estimated up to the
-        newest frame.
+        ``delay_frames`` before the newest frame, if any. ``jitter`` and ``bias_sigma`` (S,) metres along an axis are
+        estimated from each body so far.
         """
         self._take(windows, history)
-        return None if smoothed is None else self._denoised(smoothed, history, jitter, len(self._reconstructed) - 1)
+        if smoothed is None:
+            return None
+        return self._denoised(smoothed, history, jitter, bias_sigma, len(self._reconstructed) - 1)
 
-    def flush(self, held: list[Smoothed], history: History, jitter: Floats) -> list[Smoothed]:
+    def flush(self, held: list[Smoothed], history: History, jitter: Floats, bias_sigma: Floats) -> list[Smoothed]:
         """Denoise the last estimates that the smoother held, oldest first."""
-        return [self._denoised(smoothed, history, jitter, len(held) - 1 - k) for k, smoothed in enumerate(held)]
+        backs = reversed(range(len(held)))
+        return [self._denoised(one, history, jitter, bias_sigma, back) for one, back in zip(held, backs, strict=True)]
 
     def _take(self, windows: BodyWindows | None, history: History) -> None:
         self._reconstructed[:-1], self._reconstructed[-1] = self._reconstructed[1:], np.nan
@@ -119,15 +127,17 @@ class Denoise:
         renewed = np.where(seen[:, None, None], before + RENEWAL * (latest - before), before)
         self._reconstructed[:, slots] = np.where(np.isnan(before), latest, renewed)
 
-    def _denoised(self, smoothed: Smoothed, history: History, jitter: Floats, back: int) -> Smoothed:
+    def _denoised(
+        self, smoothed: Smoothed, history: History, jitter: Floats, bias_sigma: Floats, back: int
+    ) -> Smoothed:
         """Denoise the smoother's estimate of the frame ``back`` frames before the newest.
 
         The weights minimise the variance of the fused estimate. HG-VAE's estimate has the share `NOISE_LEFT` of the
         smoother's noise variance, and an error of its own with two parts. The first part is the running mean of the
         squared distance between the two estimates, less the part that noise explains (innovation-based adaptation, as
         in adaptive Kalman filters: Mehra 1970). It lowers HG-VAE's weight in motion unlike its training data. The
-        second part is HG-VAE's lag times the joint's speed. Only jitter counts as noise, because HG-VAE reproduces
-        bias.
+        second part is HG-VAE's lag times the joint's speed. Of errors that last, a window shows the part that changes
+        within it; in its newest frames HG-VAE follows them, so there only jitter counts as noise.
         """
         reconstructed = self._reconstructed[-1 - back]
         seen = np.isfinite(history.positions[-1 - back][..., 0])
@@ -136,18 +146,19 @@ class Denoise:
         # and between two observations that are close in time
         seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
         late = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S)) * FPS
+        noise = np.hypot(jitter, min(back / SETTLED, 1.0) * bias_sigma)
         positions, sigma = smoothed.positions.copy(), smoothed.sigma.copy()
-        _denoise(positions, sigma, seen, reconstructed, jitter, late, self._apart, self._frames, self._before)
+        _denoise(positions, sigma, seen, reconstructed, noise, late, self._apart, self._frames, self._before)
         self._before = smoothed.positions
         return smoothed._replace(positions=positions, sigma=sigma)
 
 
 @njit(cache=True)
-def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames, before):
+def _denoise(positions, sigma, seen, reconstructed, noise, late, apart, frames, before):
     """Denoise the joints (S, 22, 3) that are ``seen`` (S, 22), and their deviations, in place: see `Denoise._denoised`.
 
     ``late`` is HG-VAE's lag in frames, ``apart`` and ``frames`` are the state of the running mean, and ``before`` is
-    the smoother's estimate one frame earlier.
+    the smoother's estimate one frame earlier. ``noise`` (S,) is in metres along an axis.
     """
     moved = np.empty(3)
     for slot in range(len(positions)):
@@ -163,7 +174,7 @@ def _denoise(positions, sigma, seen, reconstructed, jitter, late, apart, frames,
                 continue
             frames[slot, joint] += 1.0
             apart[slot, joint] += (square - apart[slot, joint]) / min(frames[slot, joint], MEMORY)
-            gained = (1.0 - NOISE_LEFT) * min(sigma[slot, joint], jitter[slot]) ** 2
+            gained = (1.0 - NOISE_LEFT) * min(sigma[slot, joint], noise[slot]) ** 2
             own = max(max(apart[slot, joint], square / SUDDEN) - gained, MODEL_SIGMA**2) + late**2 * (speed / 3.0)
             share = gained / (gained + own)
             for axis in range(3):

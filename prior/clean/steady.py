@@ -6,8 +6,8 @@ motion. Here, a revision takes a few frames: each estimate is blended with what 
 joint then seemed to move, expected of it. Where nothing is revised, as in a perfect input, nothing changes.
 
 Where the sensor's noise lasts, a joint is then moved to the middle between the previous answer and the next frame's
-estimate, because what bends its path within three frames is seldom motion. How far is limited by how far this joint's
-estimates lie from its observations: in a perfect input, it stays.
+estimate, because what bends a slow joint's path within three frames is seldom motion. How far is limited by how far
+this joint's estimates lie from its observations: in a perfect input, it stays.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ SHARE = 0.2
 """Share of the expectation in the answer. With 0.3 and 0.5, a joint's jitter falls further, but in white noise its
 position error grows by 0.7 and 1.8 instead of 0.3 % (validation, benchmarks/NOTEBOOK.md)."""
 
-
 STRAIGHTEN = 0.4
-"""Largest move to the middle, relative to the mean distance of estimates from observations. With 0.7, a Kinect's
-acceleration error falls by 2 % more, and fast people in noise that lasts are 0.5 % farther off (validation)."""
+"""Largest move to the middle of a joint at rest, relative to the mean distance of estimates from observations."""
+
+FAST = 0.5
+"""Speed at which the largest move is halved, m/s: the faster a joint, the more of what bends its path is motion. With
+1, a Kinect's acceleration error falls by 1 % more, and runners are 0.6 % farther off (validation)."""
 
 LOOK_AHEAD = 3
-"""Least delay at which joints are moved to the middle, frames. With less, the next frame's estimate is too uncertain: at
-2, positions in noise that lasts are 1.2 % farther off."""
+"""Least delay at which joints are moved to the middle, frames. With less, the next frame's estimate is too uncertain:
+at 2, what changes of a Kinect's error is 0.8 % larger (validation)."""
 
 MEMORY_S = 0.5
 """Time constant of that mean distance, seconds."""
@@ -83,6 +85,7 @@ class Steady:
         change = (np.linalg.norm(positions - observed, axis=-1) - self._distance) / (MEMORY_S * FPS)
         self._distance += np.where(np.isfinite(change), change, 0.0)
         way = 0.5 * (self._last + following) - positions
-        most = STRAIGHTEN * lasting[:, None] * self._distance
+        speed = 0.5 * FPS * np.linalg.norm(following - self._last, axis=-1)
+        most = STRAIGHTEN * lasting[:, None] * self._distance / (1.0 + np.square(speed / FAST))
         share = most / np.maximum(np.hypot(np.linalg.norm(way, axis=-1), most), TINY)
         return np.where(np.isfinite(way), way * share[..., None], 0.0)

@@ -4,10 +4,11 @@ from tests.helpers.bodies import waving
 from tests.helpers.values import clean_bodies, gated
 
 from steadypose.msgs.types import JointState
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
-from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, Denoise, _place_pelvis
+from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, SETTLED, Denoise, _place_pelvis
 from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 from steadypose.prior.timing.kalman import Smoothed
 
@@ -60,27 +61,47 @@ def test_the_weight_is_that_of_least_variance() -> None:
     history.append(gated(np.zeros((1, 22, 3))))
     stage._reconstructed[:] = 1e-4
     smoothed = Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.012))
-    share = stage.flush([smoothed], history, jitter)[0].positions[0, 0, 0] / 1e-4
+    share = stage.flush([smoothed], history, jitter, np.zeros_like(jitter))[0].positions[0, 0, 0] / 1e-4
     first, second, both = 0.012**2, NOISE_LEFT * 0.012**2 + MODEL_SIGMA**2, NOISE_LEFT * 0.012**2
     variance = [(1 - w) ** 2 * first + w**2 * second + 2 * w * (1 - w) * both for w in np.linspace(0, 1, 10_001)]
     assert share == pytest.approx(np.argmin(variance) / 10_000, abs=2e-4)
-    assert stage.flush([smoothed], history, jitter)[0].sigma[0, 0] == pytest.approx(np.sqrt(min(variance)), rel=1e-3)
+    assert stage.flush([smoothed], history, jitter, np.zeros_like(jitter))[0].sigma[0, 0] == pytest.approx(
+        np.sqrt(min(variance)), rel=1e-3
+    )
 
 
-def test_motion_that_the_model_does_not_know_takes_its_belief_away_and_lasting_errors_give_it_none() -> None:
+def test_motion_that_the_model_does_not_know_takes_its_belief_away_and_so_does_a_sensor_without_noise() -> None:
     history, smoothed = History(4, 1), Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.02))
     history.append(gated(np.zeros((1, 22, 3))))
 
     def moved(apart: float, jitter: float) -> list[float]:
         stage = Denoise(delay_frames=0, slots=1)
         stage._reconstructed[:] = apart
-        found = [stage.flush([smoothed], history, np.array([jitter]))[0].positions[0, 0, 0] for _ in range(20)]
+        found = [
+            stage.flush([smoothed], history, np.array([jitter]), np.zeros(1))[0].positions[0, 0, 0] for _ in range(20)
+        ]
         return [place / apart for place in found]
 
     near, far = moved(0.01, 0.04), moved(0.2, 0.04)
     assert near[-1] > 0.75
     assert max(far) < 0.01, "at once, not when the mean has it"
     assert max(moved(0.01, 0.001)) < 0.02
+
+
+@pytest.mark.parametrize("back", [0, 2, 4, 8])
+def test_errors_that_last_count_as_noise_where_the_window_has_settled(back: int) -> None:
+    history, smoothed = History(12, 1), Smoothed(0.0, np.zeros((1, 22, 3)), np.full((1, 22), 0.05))
+    for _ in range(back + 1):
+        history.append(gated(np.zeros((1, 22, 3))))
+
+    def moved(jitter: float, bias: float) -> Floats:
+        stage = Denoise(delay_frames=back, slots=1)
+        stage._reconstructed[:] = 0.01
+        held = [smoothed] * (back + 1)
+        return stage.flush(held, history, np.array([jitter]), np.array([bias]))[0].positions
+
+    counted = 0.02 * min(back / SETTLED, 1.0)
+    np.testing.assert_allclose(moved(0.004, 0.02), moved(np.hypot(0.004, counted), 0.0))
 
 
 def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
@@ -91,7 +112,7 @@ def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:
     stage._reconstructed[:] = 1.0
     stage.forget(np.array([False, True]))
     smoothed = Smoothed(0.0, np.zeros((2, 22, 3)), np.full((2, 22), 0.012))
-    moved = stage.flush([smoothed], history, jitter)[0].positions[..., 0]
+    moved = stage.flush([smoothed], history, jitter, np.zeros_like(jitter))[0].positions[..., 0]
     assert moved[0, J["left_wrist"]] == 0
     assert (moved[0, : J["left_wrist"]] > 0).all()
     assert (moved[1] == 0).all()

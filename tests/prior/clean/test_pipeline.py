@@ -54,7 +54,8 @@ def test_without_any_network_of_windows_frames_may_be_lost(delay: int, lost: int
 
 
 def test_with_a_longer_delay_a_frame_keeps_what_it_was_decoded_to_as_the_centre() -> None:
-    settings = {"fuse": {"enabled": False}, "person": {"enabled": False}, "refine": {"enabled": True}}
+    off = {name: {"enabled": False} for name in ("fuse", "person", "steady")}
+    settings = {**off, "refine": {"enabled": True}}
     messages = stream(waving(30) @ yaw_matrix(-1.2))  # faces to its left
     centre, late = (clean(messages, delay=delay, **settings)[0] for delay in (4, 10))
     for a, b in list(zip(centre, late, strict=True))[:20]:

@@ -6,11 +6,11 @@ from tests.helpers.values import clean_bodies, estimate
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import REST_POSITIONS, J
 from steadypose.prior.clean.frame import Estimate
-from steadypose.prior.clean.steady import LOOK_AHEAD, MEMORY_S, SHARE, STRAIGHTEN, Steady
+from steadypose.prior.clean.steady import FAST, LOOK_AHEAD, MEMORY_S, SHARE, STRAIGHTEN, Steady
 from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.timing.rate import FPS
 
-STEP = np.full((1, 22, 3), 0.03)
+STEP = np.full((1, 22, 3), 0.003)
 WRIST = J["left_wrist"]
 
 
@@ -80,7 +80,9 @@ def test_how_far_is_limited_by_how_far_estimates_lie_from_observations(apart: fl
     off, forgotten = 0.05, 1 - 1 / (MEMORY_S * FPS)
     last = np.linalg.norm(SHARE * off * np.ones(3) + [apart, 0.0, 0.0])
     distance = forgotten * (1 - forgotten**60) * apart + (1 - forgotten) * last
-    most, middle = STRAIGHTEN * lasting * distance, 0.5 * (1 - SHARE) * np.sqrt(3) * off
+    middle = 0.5 * (1 - SHARE) * np.sqrt(3) * off
+    speed = 0.5 * FPS * np.sqrt(3) * (2 * STEP[0, 0, 0] + (1 - SHARE) * off)
+    most = STRAIGHTEN * lasting * distance / (1 + (speed / FAST) ** 2)
     assert _straightened(off, apart, lasting) == pytest.approx(most * middle / np.hypot(middle, most), rel=1e-6)
 
 
