@@ -39,7 +39,7 @@ UNTRUSTED = "the output cannot be trusted, because of the problems above"
 NO_POSE = "the output has no pose, because of the problems above"
 OTHER_FORMATS = {
     *(".npy", ".json", ".jsonl", ".txt", ".tsv", ".xlsx", ".pkl", ".pt", ".h5", ".hdf5", ".mat", ".parquet", ".bag"),
-    *(".bvh", ".fbx", ".glb", ".gltf", ".c3d", ".trc", ".mp4", ".gif", ".png"),
+    *(".bvh", ".fbx", ".glb", ".gltf", ".vrma", ".c3d", ".trc", ".mp4", ".gif", ".png"),
 }
 """endings that are never meant as a recording's name, which is that of a folder"""
 
@@ -72,7 +72,7 @@ def check_format(out: Path) -> None:
     if out.suffix in OTHER_FORMATS:
         raise LaunchError(
             f"{out}: expected .npz or .csv for arrays, or a name without ending for a recording, got {out.suffix}; "
-            "`steadypose export` writes .bvh, .glb and .trc"
+            "`steadypose export` makes a .bvh, .glb, .vrma or .trc of an .npz"
         )
 
 

@@ -155,6 +155,7 @@ ANSWERED = {
     "plot in.txt": "in.txt: expected a rosbag2 directory, an .mcap",
     "clean hip.csv /proc/out.npz": "expected a folder that can be written to",
     "clean in.csv out.json": "expected .npz or .csv for arrays, or a name without ending for a recording",
+    "clean in.csv out.vrma": "`steadypose export` makes a .bvh, .glb, .vrma or .trc of an .npz",
     "export in.csv out.bvh": "clean it first: steadypose clean in.csv in.npz",
     "clean in.csv out.npz --events events.json": "events.json: expected a name ending in .csv",
     "clean . ../out --events ../events.csv": "--events: expected a single recording as IN",
