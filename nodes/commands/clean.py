@@ -24,7 +24,7 @@ from steadypose.nodes.commands.output import (
 )
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
-from steadypose.nodes.settings import LaunchError, printable
+from steadypose.nodes.settings import LaunchError, launch_errors, printable
 from steadypose.prior.body.layouts import add_layouts
 
 
@@ -81,8 +81,11 @@ def clean(
         apply_override(table, full_key(override, pipeline_sections()))
     check_settings(table)
     if skeletons is not None:
-        table["skeletons"] = read_toml(skeletons).get("skeletons", {})
-        add_layouts(table["skeletons"])
+        table["skeletons"] = read_toml(skeletons).get("skeletons")
+        if not isinstance(table["skeletons"], dict):
+            raise LaunchError(f"{skeletons}: expected sections [skeletons.NAME] with joints, got none")
+        with launch_errors():
+            add_layouts(table["skeletons"])
     if rig is not None:
         table["rig"] = read_toml(rig)
     check_format(out)

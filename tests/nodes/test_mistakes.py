@@ -142,6 +142,7 @@ FILES = {
     "mine.toml": "[input]\nrecording = 'walk_turn'\n[prior.gate]\njmup = 2",
     "in.bvh": "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Xrotation Yrotation Zrotation\nEnd Site\n{\nOFFSET"
     " 0 1 0\n}\n}\nMOTION\nFrames: 2\nFrame Time: 0.03\n0 0 0\n0 0 0\n",
+    "own.toml": "[skeletons.own]\njoints = ['left_hip', 'right_hip']\ncanonical = {left_wrist = 'HandL'}",
     "in.npy": "x", "in.png": "x", "in.txt": "x",
 }  # fmt: skip
 ANSWERED = {
@@ -156,6 +157,8 @@ ANSWERED = {
     "clean hip.csv /proc/out.npz": "expected a folder that can be written to",
     "clean in.csv out.json": "expected .npz or .csv for arrays, or a name without ending for a recording",
     "clean in.csv out.vrma": "`steadypose export` makes a .bvh, .glb, .vrma or .trc of an .npz",
+    "clean in.csv out.npz --skeletons own.toml": "left_wrist: expected names of joints, got ['HandL']",
+    "clean in.csv out.npz --skeletons mine.toml": "mine.toml: expected sections [skeletons.NAME] with joints, got none",
     "export in.csv out.bvh": "clean it first: steadypose clean in.csv in.npz",
     "clean in.csv out.npz --events events.json": "events.json: expected a name ending in .csv",
     "clean . ../out --events ../events.csv": "--events: expected a single recording as IN",
