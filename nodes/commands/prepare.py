@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
@@ -58,7 +59,7 @@ def prepare(
       steadypose prepare mocap/                        everything, a few minutes
       steadypose prepare mocap/cmu_amc.tar.xz --out /tmp/cmu
       steadypose prepare my-takes/ --rig studio.toml   files that are not recognised
-      steadypose prepare mocap/ --speeds 1 --speeds 2  add motion at twice the speed
+      steadypose prepare mocap/ --speeds 2             add motion at twice the speed
 
     Args:
         mocap: a data set, or a folder of them.
@@ -67,6 +68,9 @@ def prepare(
         rig: TOML file that describes files which are not recognised: metres (length of their unit), up, fps, skeleton
             (of .npy), and [canonical], which names their joint for each of smpl22 (docs/sources.md).
     """
+    if not all(0 < speed < math.inf for speed in speeds):
+        raise LaunchError(f"--speeds: expected numbers above 0, got {', '.join(f'{speed:g}' for speed in speeds)}")
+    speeds = tuple(dict.fromkeys(speeds))  # those given are added to 1, which may be given too
     console = Console(markup=False)
     sources = find_sources(mocap)
     if rig is not None:

@@ -11,6 +11,7 @@ from tests.training.data.test_motion_plug_in_gait import BENDS, STILL, recording
 
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.commands.prepare import prepare
+from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.rigs import recognise_points
 from steadypose.prior.body.skeleton import JOINTS, REST_POSITIONS, J
@@ -160,3 +161,14 @@ def test_a_folder_of_any_name_is_prepared_each_folder_a_person(tmp_path: Path) -
     with np.load(tmp_path / "data" / "prepared.npz") as z:
         assert dict(zip(z["subject"].tolist(), z["split"].tolist(), strict=True)) == {"anna": "train", "val/bob": "val"}
         assert z["positions"].shape[1] == len(JOINTS)
+
+
+def test_motion_is_prepared_once_at_each_speed(tmp_path: Path) -> None:
+    (tmp_path / "takes").mkdir()
+    content = write_bvh(FAMILIES["Xsens"].joints(), np.array([0.0, 99.0, 0.0]), 60.0, frames=180)
+    (tmp_path / "takes" / "stand.bvh").write_bytes(content)
+    prepare(tmp_path / "takes", tmp_path / "data", (1.0, 1.0, 2.0))
+    with np.load(tmp_path / "data" / "prepared.npz") as z:
+        assert z["name"].tolist() == ["stand.bvh", "stand.bvh x2"]
+    with pytest.raises(LaunchError, match="--speeds: expected numbers above 0, got 1, 0"):
+        prepare(tmp_path / "takes", tmp_path / "data", (1.0, 0.0))
