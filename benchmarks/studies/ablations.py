@@ -1,11 +1,10 @@
 """Ablations: accuracy and cost of each part of the default, each switched off separately.
 
-A part with a setting is switched off by it. The whole-body experts and the multiple-model estimate's weight in white
-noise have none and are replaced in place. The trajectory's parts are ablated after the default prior, in
-time-correlated noise of 2 cm, with a known floor. Errors are means over people, relative to what ships, paired by clip
-(`benchmarks.scores`). Some parts move no joint but decide what is flagged: their table has false alarms, and faults
-that are found. Cost is measured on one body with a hidden arm, a frame at a time, so that every part has
-work.
+A part with a setting is switched off by it. Others are replaced in place. The trajectory's parts are ablated after the
+default prior, in time-correlated noise of 2 cm, with a known floor. Errors are means over people, relative to what
+ships, paired by clip (`benchmarks.scores`). Some parts move no joint but decide what is flagged: their table has false
+alarms, and faults that are found. Cost is measured on one body with a hidden arm, a frame at a time, so that every part
+has work.
 """
 
 from __future__ import annotations
@@ -32,7 +31,10 @@ from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.prior.arrays import Floats
+from steadypose.prior.clean import steady
+from steadypose.prior.clean.exchanged import ExchangedLimbs
 from steadypose.prior.clean.pipeline import PriorPipeline
+from steadypose.prior.clean.reconstruct import Denoise
 from steadypose.prior.clean.settings import (
     DenoiseSettings,
     FuseSettings,
@@ -70,6 +72,14 @@ class Part(NamedTuple):
 PARTS: Mapping[str, Part] = {
     AS_IT_SHIPS: Part(PriorSettings()),
     "without the gate": Part(PriorSettings(gate=GateSettings(enabled=False))),
+    "without putting sides back": Part(
+        PriorSettings(),
+        lambda: mock.patch.multiple(
+            ExchangedLimbs,
+            begin=lambda _, positions: np.zeros(positions.shape[:2], dtype=bool),
+            update=lambda _, positions, *__: (0, np.zeros(positions.shape[:2], dtype=bool)),
+        ),
+    ),
     "without the whole-body experts": Part(
         PriorSettings(), lambda: mock.patch.object(inference, "body_covariance", return_value=np.eye(22))
     ),
@@ -78,12 +88,21 @@ PARTS: Mapping[str, Part] = {
     ),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
+    "without denoising noise that lasts": Part(
+        PriorSettings(),
+        lambda: mock.patch.object(
+            Denoise,
+            "_denoised",
+            lambda *of, bare=Denoise._denoised: bare(*of[:-2], np.zeros_like(of[-2]), of[-1]),
+        ),
+    ),
     "without the person's bones": Part(PriorSettings(person=PersonSettings(enabled=False))),
     "without the score": Part(PriorSettings(score=ScoreSettings(enabled=False))),
     "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
     "without fusion": Part(PriorSettings(fuse=FuseSettings(enabled=False))),
     "without the posture": Part(PriorSettings(posture=PostureSettings(enabled=False))),
     "without the steady stage": Part(PriorSettings(steady=SteadySettings(enabled=False))),
+    "without straight paths": Part(PriorSettings(), lambda: mock.patch.object(steady, "STRAIGHTEN", 0.0)),
     "without orientations by the whole body": Part(PriorSettings(orient=OrientSettings(enabled=False))),
     "with HM-VAE, which is off": Part(PriorSettings(refine=RefineSettings(enabled=True))),
 }
@@ -99,8 +118,10 @@ PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
 
 CONDITIONS: Mapping[str, Condition] = {
     name: (noisy_joints.CONDITIONS | hidden_joints.CONDITIONS)[name]
-    for name in ("1 cm", "2 cm", "4 cm", "lasting 2 cm", "lasting 2 cm, spikes, swaps", "0.5 s", "legs never")
-}
+    for name in (
+        "1 cm", "2 cm", "4 cm", "1 cm, sides", "lasting 2 cm", "lasting 2 cm, spikes, swaps", "0.5 s", "legs never"
+    )
+}  # fmt: skip
 """Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
 
 FLAGGING = (
