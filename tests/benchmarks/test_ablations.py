@@ -3,12 +3,19 @@ from dataclasses import asdict, fields, is_dataclass, replace
 import numpy as np
 
 from steadypose.benchmarks import product
+from steadypose.benchmarks.corruption import correlated, gaussian, sides_exchanged
 from steadypose.benchmarks.motion import simulated_clips
 from steadypose.benchmarks.studies.ablations import AS_IT_SHIPS, PARTS, PARTS_OF_THE_WORLD, _record, _table
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.world.settings import TrajectorySettings
 
-REPLACED = {"without the whole-body experts", "without the share of white noise"}
+REPLACED = {
+    "without putting sides back",
+    "without the whole-body experts",
+    "without the share of white noise",
+    "without denoising noise that lasts",
+    "without straight paths",
+}
 
 
 def test_each_row_changes_one_setting_and_every_stage_that_is_on_has_a_row() -> None:
@@ -24,8 +31,8 @@ def test_each_row_changes_one_setting_and_every_stage_that_is_on_has_a_row() -> 
 
 
 def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
-    clips = simulated_clips(40, 1, seed=0)
-    seen = clips.positions + np.random.default_rng(0).normal(0.0, 0.02, clips.positions.shape)
+    clips, rng = simulated_clips(60, 1, seed=0), np.random.default_rng(0)
+    seen = sides_exchanged(gaussian(correlated(clips.positions, 0.02, rng), 0.01, rng), rng)
 
     def positions() -> np.ndarray:
         return product.run(PriorSettings(), seen, clips.stamps_s, 4).positions
