@@ -111,10 +111,10 @@ class VmcSettings(DatagramSettings):
 
 
 def unity(body: WorldBody) -> tuple[Floats, Floats]:
-    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward, whither looks
-    who faces a camera.
+    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward.
 
-    Unity's axes are left-handed, so positions are mirrored, and the sense of rotations is reversed.
+    Unity's axes are left-handed, so positions are mirrored, and the sense of rotations is reversed. A person who faces
+    the camera looks along z.
 
     Returns:
         (22, 3) metres, the hips in the world; and (22, 4) xyzw.

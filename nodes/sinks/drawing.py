@@ -76,8 +76,10 @@ _QUARTER = Rotation.from_euler("z", 90.0, degrees=True)
 
 
 def ahead(root: NDArray[np.floating], rotations: NDArray[np.floating]) -> tuple[NDArray[np.float64], ...]:
-    """Turn a body's root (..., 3) and root rotation (..., 4) xyzw about the vertical, for programs of animation: who
-    faces a camera, which looks along y, then faces x, their front; and a y-up file is written as it was read.
+    """Turn a body's root (..., 3) and root rotation (..., 4) xyzw about the vertical, for animation programs.
+
+    A person who faces the camera, which looks along y, then faces x, and so +z in y-up axes, which is the front in
+    these programs. A y-up file is written as it was read.
     """
     return _QUARTER.apply(root), (_QUARTER * Rotation.from_quat(rotations)).as_quat()
 

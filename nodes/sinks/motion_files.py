@@ -1,6 +1,6 @@
 """Writes one cleaned body at a constant rate, with constant bone lengths, as BVH, CSV or TRC.
 
-BVH is in centimetres, y up, with a T pose that faces +z as rest pose, as does who faces a camera. CSV is as
+BVH is in centimetres, y up, with a T pose that faces +z as rest pose; a person who faces the camera does too. CSV is as
 `nodes.sources.recording` reads it. TRC is as OpenSim reads it.
 """
 
@@ -47,7 +47,7 @@ class BodyMotion:
     """stamp of the first frame, seconds"""
 
     def ahead(self) -> BodyMotion:
-        """The motion with its world turned for programs of animation (`drawing.ahead`)."""
+        """The motion with its world turned for animation programs (`drawing.ahead`)."""
         root, rotations = self.root, self.rotations.copy()
         root, rotations[:, 0] = ahead(root, rotations[:, 0])
         return replace(self, root=root, rotations=rotations)
