@@ -78,24 +78,25 @@ def test_errors_along_a_direction_are_those_of_a_least_squares_fit(seed: int, mi
 def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_noise(seed: int, missing: float, back: int):
     rng = np.random.default_rng(seed)
     frames, stage, history = observed(rng, missing), Denoise(back, SLOTS), History(8, SLOTS)
-    jitter = rng.uniform(0.0, 0.02, SLOTS)
+    jitter, bias = rng.uniform(0.0, 0.02, (2, SLOTS))
     apart, count, before = np.zeros((SLOTS, 22)), np.zeros((SLOTS, 22)), np.full((SLOTS, 22, 3), np.nan)
     late = np.interp(back, (0, reconstruct.SETTLED), (reconstruct.LATE_NEWEST_S, reconstruct.LATE_S)) * FPS
     for frame in frames:
         history.append(gated(frame))
         stage._reconstructed[:] = frame + rng.normal(0.0, 0.02, frame.shape)
         smoothed = Smoothed(0.0, frame, np.where(np.isnan(frame[..., 0]), np.inf, 0.01))
-        found = stage._denoised(smoothed, history, jitter, back)
+        found = stage._denoised(smoothed, history, jitter, bias, back)
         seen = np.isfinite(history.positions[-1 - back][..., 0])
         seen |= ~seen.any(axis=1, keepdims=True)
         seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < reconstruct.BRIEF_S)
         moved = stage._reconstructed[-1 - back] - frame
         square = np.square(moved).mean(axis=-1)
         positions, sigmas = frame.copy(), smoothed.sigma.copy()
+        noise = np.hypot(jitter, bias * back / reconstruct.SETTLED)
         for at in zip(*np.nonzero(seen & np.isfinite(square)), strict=True):
             count[at] += 1
             apart[at] += (square[at] - apart[at]) / min(count[at], reconstruct.MEMORY)
-            gained = (1 - reconstruct.NOISE_LEFT) * min(sigmas[at], jitter[at[0]]) ** 2
+            gained = (1 - reconstruct.NOISE_LEFT) * min(sigmas[at], noise[at[0]]) ** 2
             own = max(max(apart[at], square[at] / reconstruct.SUDDEN) - gained, reconstruct.MODEL_SIGMA**2)
             own += late**2 * np.square(np.nan_to_num(frame[at] - before[at])).mean()
             share = gained / (gained + own)

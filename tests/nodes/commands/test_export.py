@@ -192,7 +192,7 @@ def test_the_rate_of_rounded_stamps_is_the_sensors(motion: BodyMotion, stamps: F
 
 def test_a_rounded_frame_time_costs_no_frame(motion: BodyMotion) -> None:
     whole, turned = (np.tile(part, (20, 1, 1)) for part in (motion.positions, motion.rotations))
-    found = steady(0.008333 * np.arange(len(whole)), whole, turned)
+    found = steady(np.arange(len(whole)) * np.float64(0.008333), whole, turned)
     assert (found.fps, len(found.root)) == (120.0, len(whole))
 
 
