@@ -24,8 +24,8 @@ _LASTING = "measured before noise that lasts was denoised by HG-VAE too, which m
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            "contacts", "counter", "event_mocap", "events", "fidelity", "heading", "hidden_joints", "humor",
-            "kinect_vicon", "latency", "layouts", "mediapipe", "noisy_joints", "restart", "retarget", "rotations",
+            "contacts", "counter", "event_mocap", "events", "fidelity", "hidden_joints", "humor",
+            "kinect_vicon", "latency", "layouts", "mediapipe", "restart", "retarget", "rotations",
             "scale", "world",
         ),
         _LASTING,

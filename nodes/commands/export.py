@@ -47,7 +47,7 @@ def export(
     The file holds one person, in the world frame (floor at 0 if the sensor's pose is calibrated), at the input's frame
     rate. Bone lengths are constant, the rotations are those of 'clean', the body is placed by all its joints, and the
     rest pose is a T-pose.
-      .bvh   animation programs: centimetres, y up; a person facing the camera faces +z
+      .bvh   animation programs: centimetres, y up; who faces the camera faces +z
       .glb   Blender, Unity, Unreal, browsers: a body with bones; metres, y up
       .vrma  VRM avatars: three-vrm, UniVRM, VRM Posing Desktop
       .csv   spreadsheets, and steadypose itself: metres, z up, and quaternions xyzw
