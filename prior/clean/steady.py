@@ -67,7 +67,7 @@ class Steady:
             estimate: of one frame.
             step: (S, 22, 3) metres, the joints' motion to the next frame as estimated now; None if there is no later
                 frame.
-            observed: (S, 22, 3) metres, the joints as observed in this frame.
+            observed: (S, 22, 3) metres, the joints as observed in this frame; NaN where unobserved or rejected.
             lasting: (S,) certainty that the sensor's noise lasts, from 0 to 1.
         """
         refined = (estimate.state == JointState.REFINED)[..., None]
@@ -76,7 +76,7 @@ class Steady:
         following = positions + (np.nan if step is None else step)
         self._expected = np.where(refined, following, np.nan)
         if self._straightens:
-            positions = positions + self._to_middle(positions, following, np.where(refined, observed, np.nan), lasting)
+            positions = positions + self._to_middle(positions, following, observed, lasting)
         self._last = np.where(refined, positions, np.nan)
         return replace(estimate, positions=positions)
 

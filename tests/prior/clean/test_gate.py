@@ -8,6 +8,7 @@ from tests.helpers.values import clean_bodies, observation
 
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import MIRROR, J, limbs
+from steadypose.prior.clean.exchanged import ExchangedLimbs
 from steadypose.prior.clean.gate import Gate
 from steadypose.prior.clean.mirrored import FIRST, IN_A_ROW, LONGEST, REMEMBERED
 from steadypose.prior.clean.settings import GateSettings
@@ -165,6 +166,12 @@ def test_a_body_that_faces_the_other_way_all_at_once_is_believed_before_long() -
     passed, counters = run(positions)
     assert counters["limbs_exchanged"]
     assert np.array_equal(passed[55:], positions[55:])
+
+
+def test_in_noise_that_hides_the_posture_no_first_frame_is_exchanged() -> None:
+    noise = np.random.default_rng(0).normal(0.0, [0.04, 0.12, 0.04], (300, 22, 3))
+    seen = waving(300) + noise
+    assert not ExchangedLimbs(0.3, 300).begin(seen).any()
 
 
 def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
