@@ -24,7 +24,7 @@ _LASTING = "measured before noise that lasts was denoised by HG-VAE too, which m
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            "contacts", "counter", "event_mocap", "events", "fidelity", "hidden_joints", "humor",
+            "contacts", "counter", "event_mocap", "events", "hidden_joints", "humor",
             "kinect_vicon", "latency", "layouts", "mediapipe", "restart", "retarget", "rotations",
             "scale", "world",
         ),
