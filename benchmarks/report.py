@@ -25,7 +25,7 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             "contacts", "counter", "event_mocap", "events", "hidden_joints", "humor",
-            "kinect_vicon", "latency", "layouts", "mediapipe", "restart", "retarget", "rotations",
+            "latency", "layouts", "mediapipe", "restart", "retarget", "rotations",
             "scale", "world",
         ),
         _LASTING,
