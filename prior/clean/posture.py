@@ -51,7 +51,7 @@ class Posture:
         Args:
             estimate: of one frame; its deviations may leave out what no joint of the body shows.
             lengths: (S, 22) metres, length of each joint's bone.
-            noise: (S,) metres along an axis, the sensor's jitter and bias, estimated from each body.
+            noise: (S,) metres along an axis, the sensor's jitter and lasting error, estimated from each body.
             lasting: (S,) certainty that this noise lasts, from 0 to 1.
         """
         slots = np.flatnonzero(np.isfinite(estimate.positions).all(axis=(1, 2)))

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from tests.helpers.bodies import waving
 from tests.helpers.values import clean_bodies, gated
 
@@ -102,6 +103,25 @@ def test_errors_that_last_count_as_noise_where_the_window_has_settled(back: int)
 
     counted = 0.02 * min(back / SETTLED, 1.0)
     np.testing.assert_allclose(moved(0.004, 0.02), moved(np.hypot(0.004, counted), 0.0))
+
+
+@pytest.mark.parametrize(("correlation", "least", "most"), [(0.0, 0.0, 0.002), (0.9, 0.005, 0.02)])
+def test_a_bias_counts_unless_noise_is_known_to_be_white(
+    correlation: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bones whose own lengths vary, as between markers on skin, look like a bias."""
+    counted, update = [], Denoise.update
+
+    def noted(*args) -> Smoothed | None:
+        counted.append(args[-1].max())
+        return update(*args)
+
+    monkeypatch.setattr(Denoise, "update", noted)
+    truth = waving(100) * (1 + 0.02 * np.sin(np.arange(100) / 12))[:, None, None]
+    noise = np.random.default_rng(1).normal(0.0, 0.005, truth.shape)
+    clean_bodies(truth + lfilter([1.0], [1.0, -correlation], noise, axis=0))
+    assert least <= min(counted[40:])
+    assert max(counted[40:]) <= most
 
 
 def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:

@@ -80,7 +80,7 @@ def test_each_stream_has_the_deviations_of_its_own_layout() -> None:
         body.confidence = body.confidence[:17]
     answers, _ = serve(coco, canonical)
     interpolated, measured = (answers[name][12].bodies[0].sigma[[0, J["neck"]]] for name in ("coco", "canonical"))
-    assert interpolated.min() > 0.015 > measured.max()
+    assert interpolated.min() > 0.014 > measured.max()
 
 
 @pytest.mark.parametrize("identify", [False, True])
