@@ -20,7 +20,7 @@ import numpy as np
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import INTERPOLATED, NEEDED, Skeleton, middles
 from steadypose.prior.body.mixtures import COLLAR
-from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, J
+from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
 from steadypose.prior.npz import MotionError
 
 Mixture = Mapping[str, float]
@@ -34,6 +34,9 @@ the unit is not guessed."""
 
 ON_THE_JOINT = 0.15
 """Share of a bone within which a canonical joint near its end moves to the end, where the body turns."""
+
+MOST_ASIDE = 0.8
+"""Largest length of the bone to a hip, relative to the thigh: between rest skeletons' 0.3 and a knee's 1.0."""
 
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("L", "R"), ("l", "r"))
 _INLINE = re.compile(r"twist|roll", re.IGNORECASE)
@@ -166,11 +169,15 @@ def recognise(tree: Tree) -> Rig:
 
 def up_axis(bodies: Floats) -> str:
     """Return the axis that points up in a file's joints (T, 22, 3), NaN where missing: ``y``, ``-y`` or ``z``, along
-    which heads are farthest from ankles.
+    which heads are farthest from ankles or, if a file lacks these, shoulders from hips.
     """
-    upwards = bodies[:, J["head"]] - bodies[:, [J["left_ankle"], J["right_ankle"]]].mean(axis=1)
-    known = upwards[np.isfinite(upwards).all(axis=1)]
-    _, y, z = known.mean(axis=0) if len(known) else (0.0, 1.0, 0.0)
+    known = np.array([[0.0, 1.0, 0.0]])
+    for high, low in (([J["head"]], [J["left_ankle"], J["right_ankle"]]), (list(SHOULDERS), list(HIPS))):
+        upwards = bodies[:, high].mean(axis=1) - bodies[:, low].mean(axis=1)
+        if (finite := np.isfinite(upwards).all(axis=1)).any():
+            known = upwards[finite]
+            break
+    _, y, z = known.mean(axis=0)
     return max({"y": y, "-y": -y, "z": z}.items(), key=lambda axis: axis[1])[0]
 
 
@@ -209,7 +216,7 @@ def collar(spine3: str | Mixture, neck: str | Mixture, shoulder: str | Mixture) 
 def recognise_points(names: Sequence[str]) -> Skeleton:
     """Recognise the skeleton of named points in TRC and C3D files by their names, as points have no tree.
 
-    A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``R.Ankle`` are the same joint. Pelvis,
+    A name has a side and a part: ``RAnkle``, ``right_ankle``, ``ANKLE_R`` and ``RAJC`` are the same joint. Pelvis,
     neck and head may lie between hips, shoulders and ears. A joint without points stays unobserved.
 
     Raises:
@@ -221,6 +228,8 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
         words = [word.lower() for word in _WORDS.findall(name)]
         sides = {_SIDE_OF[word] for word in words if word in _SIDE_OF}
         part = "".join(word for word in words if word not in _SIDE_OF)
+        if not sides and part[:1] in ("l", "r") and f"left_{_PARTS.get(part[1:], part[1:])}" in JOINTS:  # LHJC, lknee
+            sides, part = {_SIDE_OF[part[0]]}, part[1:]
         if len(sides) == 1:
             sided.setdefault(f"{sides.pop()}_{_PARTS.get(part, part)}", name)
         elif part in _MIDDLE_PARTS:
@@ -230,7 +239,7 @@ def recognise_points(names: Sequence[str]) -> Skeleton:
     table = between | table | {joint: name for joint, name in sided.items() if joint in JOINTS}
     if missing := [joint for joint in NEEDED if joint not in table]:
         raise MotionError(
-            f"expected points of {', '.join(missing)}; got {', '.join(names[:8])}...; say with {BY_RIG} which"
+            f"expected points of {', '.join(missing)}; got {', '.join(names[:8]) or 'none'}...; say with {BY_RIG} which"
         )
     ordered = {joint: table[joint] for joint in JOINTS if joint in table}
     return Skeleton("points", tuple(dict.fromkeys(names)), ordered, frozenset(interpolated))
@@ -255,6 +264,12 @@ def _limbs(tree: Tree, pairs: Mapping[str, str]) -> tuple[_Limb, _Limb]:
         )
     legs, arms = sorted(limbs, key=lambda limb: len(tree.path(limb.trunk)))
     roots = [tree.joints[tree.path(limb.trunk)[0]] for limb in (legs, arms)]
+    if tree.length(legs.joints[0]) > MOST_ASIDE * tree.length(legs.joints[1]):
+        first = tree.joints[legs.joints[0]]
+        raise MotionError(
+            f"expected hips, in names that differ by left and right alone; '{first}', the first of a leg, lies where a "
+            f"knee does: rename the hips, or say with {BY_RIG} which they are"
+        )
     if roots[0] != roots[1] or tree.joints.count(roots[0]) > 1:
         raise MotionError(f"expected one body, got limbs below the roots {' and '.join(roots)}: export each body alone")
     return legs, arms

@@ -7,7 +7,9 @@ and C3D, the format of motion capture systems, through ezc3d. A `Description` ad
 from __future__ import annotations
 
 import io
+import re
 import struct
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +28,7 @@ from steadypose.prior.mocap.clip import TO_Z_UP, MotionError, documented, forwar
 from steadypose.prior.mocap.plug_in_gait import MARKERS, calibrate, joint_centres
 from steadypose.prior.npz import open_npz
 
-POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "meters": 1.0, "millimeters": 0.001}
+POINT_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001}
 SMALLEST_M = 0.1
 """Distance from the origin that some point of a person exceeds, metres."""
 
@@ -121,8 +123,13 @@ def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str
     return Skeleton("described", tuple(joints), {joint: dict.fromkeys(names, 1.0) for joint, names in sources.items()})
 
 
+def _text(content: bytes) -> str:
+    """Decode a text file: UTF-16 if its mark says so, as Windows' "Unicode" does, else UTF-8."""
+    return content.decode("utf-16" if content[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig", "replace")
+
+
 def _bvh(content: bytes, description: Description) -> _Read:
-    bvh = read_bvh(content.decode("utf-8-sig", "replace"))
+    bvh = read_bvh(_text(content))
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
     used = [bvh.joints.index(joint) for joint in rig.skeleton.joints]
     metres = description.metres or rig.metres
@@ -171,19 +178,44 @@ def _array(content: bytes, description: Description) -> _Read:
 
 
 def _trc(content: bytes, description: Description) -> _Read:
-    rows = content.decode("utf-8-sig", "replace").splitlines()
+    rows = _text(content).splitlines()
     if len(rows) < 6 or not rows[0].startswith("PathFileType"):
         raise MotionError("expected a TRC file, which begins with PathFileType and has five lines before its numbers")
     header = dict(zip(rows[1].split("\t"), rows[2].split("\t"), strict=False))
     names = [name.strip() for name in rows[3].split("\t")[2::3]]
-    names = names[: max(k + 1 for k, name in enumerate(names) if name)]
-    cells = [row.split("\t") for row in rows[5:] if row.strip()]
-    stated = header.get("NumFrames", "").strip()
-    _refuse_cut(int(stated) if stated.isdigit() else 0, len(cells))
+    names = names[: max((k + 1 for k, name in enumerate(names) if name), default=0)]
+    if not names or "DataRate" not in header:
+        raise MotionError(
+            "expected DataRate in the second line and names of points in the fourth, separated by tabs; got "
+            f"{rows[1][:40]!r} and {rows[3][:40]!r}"
+        )
+    cells = [row.replace(",", ".").split("\t") for row in rows[5:] if row.strip()]
     width = 2 + 3 * len(names)
     values = np.array([[float(c) if c.strip() else np.nan for c in (row + [""] * width)[:width]] for row in cells])
+    fps = description.fps or float(header["DataRate"].replace(",", "."))
     points = values[:, 2:].reshape(len(values), len(names), 3)
-    return _points(float(header["DataRate"]), names, points, header.get("Units", "m"), description)
+    if not description.fps:
+        points = _in_time(values[:, 1], fps, points)
+    stated = header.get("NumFrames", "").strip()
+    _refuse_cut(int(stated) if stated.isdigit() else 0, len(points))
+    return _points(fps, names, points, header.get("Units", "m"), description)
+
+
+def _in_time(times: Floats, fps: float, points: Floats) -> Floats:
+    """Points (T, J, 3) of rows at ``times`` (T,) seconds, with rows of NaN for the frames between that have none."""
+    steps = np.diff(times) * fps
+    usual = np.median(steps) if len(steps) else 0.0
+    if not usual > 0:  # the file has no times
+        return points
+    if abs(usual - 1.0) > 0.1:
+        raise MotionError(
+            f"expected one frame rate, got a DataRate of {fps:g} Hz and times of {fps / usual:.3g} Hz: correct one of "
+            f"them, or say the right fps with {BY_RIG}"
+        )
+    rows = np.cumsum([0, *np.maximum(np.round(steps), 1).astype(int)])
+    whole = np.full((rows[-1] + 1, *points.shape[1:]), np.nan)
+    whole[rows] = points
+    return whole
 
 
 def _c3d(content: bytes, description: Description) -> _Read:
@@ -195,7 +227,8 @@ def _c3d(content: bytes, description: Description) -> _Read:
         file.write(content)
         file.flush()
         point = (read := ezc3d.c3d(file.name))["parameters"]["POINT"]
-    names = [str(name).rpartition(":")[2] for name in point["LABELS"]["value"]]
+    # 255 names at most are in one parameter; the others are in LABELS2, LABELS3, ...
+    names = [str(name) for key in sorted(point) if re.fullmatch(r"LABELS\d*", key) for name in point[key]["value"]]
     points = read["data"]["points"][:3].transpose(2, 1, 0)[:, : len(names)].astype(np.float64)
     _refuse_cut(_c3d_frames(content), len(points))
     units = (point["UNITS"]["value"] or ["mm"])[0]
@@ -218,19 +251,30 @@ def _refuse_cut(stated: int, frames: int) -> None:
 
 def _points(fps: float, names: Sequence[str], points: Floats, units: str, description: Description) -> _Read:
     """Read named points, which are skin markers of the Plug-in-Gait set or joints."""
-    metres = description.metres or POINT_UNITS.get(units.strip().lower(), 0.001)
+    points = np.where((points == 0.0).all(axis=-1, keepdims=True), np.nan, points)  # how many programs write a gap
+    unit = re.sub(r"(?:([cdm])[a-z]+)?met(?:er|re)s?", r"\1m", units.strip().lower())  # millimeters: mm
+    metres = description.metres or POINT_UNITS.get(unit, 0.001)
     if not description.metres and 0 < metres * np.nanmax(np.abs(points), initial=0.0) < SMALLEST_M:
         raise MotionError(
             f"in its unit, {units}, all points are within {SMALLEST_M} m of the origin: the numbers seem to be metres; "
             f"if so, say metres = 1.0 with {BY_RIG}"
         )
+    bare = [name.rpartition(":")[2].strip() for name in names]  # Subject:Point
     if description.canonical:
-        return fps, _described(names, description.canonical), points * metres, ""
-    if set(MARKERS) <= set(names):
-        markers = {name: points[:, names.index(name)] * metres for name in MARKERS}
-        return fps, CANONICAL, joint_centres(markers, calibrate([markers])), ""
-    skeleton = recognise_points(names)
-    return fps, skeleton, points[:, [list(names).index(n) for n in skeleton.joints]] * metres, ""
+        whole = any(":" in str(joint) for joint in description.canonical.values())
+        return fps, _described(names if whole else bare, description.canonical), points * metres, ""
+    marked = set(MARKERS) <= set(bare)
+    skeleton = CANONICAL if marked else recognise_points(bare)
+    used = MARKERS if marked else {name for weights in skeleton.table.values() for name in weights}
+    subjects = {
+        name.rpartition(":")[0]: None for name, own in zip(names, bare, strict=True) if own in used and own != name
+    }
+    if len(subjects) > 1:
+        raise MotionError(f"expected one body, got points of {', '.join(subjects)}: export each body alone")
+    if marked:
+        markers = {name: points[:, bare.index(name)] * metres for name in MARKERS}
+        return fps, skeleton, joint_centres(markers, calibrate([markers])), ""
+    return fps, skeleton, points[:, [bare.index(n) for n in skeleton.joints]] * metres, ""
 
 
 _READERS: Mapping[str, Callable[[bytes, Description], _Read]] = {

@@ -284,7 +284,13 @@ def test_what_is_no_body_is_refused_in_words() -> None:
     headless = [j for j in FAMILIES["LAFAN1"].joints() if j.name not in ("Neck", "Head")]
     with pytest.raises(MotionError, match="neck and head above 'Spine2'"):
         recognise(as_tree(headless))
+    hips = {"LeftUpLeg": "HipA", "RightUpLeg": "HipB"}
     one = FAMILIES["LAFAN1"].joints()
+    sideless = [replace(j, name=hips.get(j.name, j.name), parent=hips.get(j.parent or "", j.parent)) for j in one]
+    with pytest.raises(
+        MotionError, match=r"expected hips.*'LeftLeg', the first of a leg, lies where a knee does: rename the hips"
+    ):
+        recognise(as_tree(sideless))
     other = [replace(j, name=f"B{j.name}", parent=j.parent and f"B{j.parent}") for j in one]
     with pytest.raises(MotionError, match="one body, got limbs below the roots Hips and BHips: export each"):
         recognise(as_tree([*one, *other]))
@@ -308,6 +314,9 @@ def test_sides_are_told_by_names_that_stay_names() -> None:
 def test_up_is_from_ankles_to_head(axis: str, turn: list[int]) -> None:
     assert up_axis(REST_POSITIONS[None][..., turn]) == axis
     assert up_axis(-REST_POSITIONS[None][..., [0, 2, 1]]) == "-y"
+    headless = REST_POSITIONS[None][..., turn].copy()
+    headless[:, J["head"]] = np.nan
+    assert up_axis(headless) == axis
 
 
 def test_a_bvh_may_begin_with_a_mark_of_utf_8_and_its_names_contain_spaces() -> None:
@@ -318,7 +327,8 @@ def test_a_bvh_may_begin_with_a_mark_of_utf_8_and_its_names_contain_spaces() -> 
             other = other.replace(b"JOINT " + side + name, b"JOINT " + side + b" lower " + name + b"  ")
     assert other.count(b" lower ") == 6
     assert read_motion("take.bvh", other).fps == read_motion("take.bvh", content).fps
-    np.testing.assert_array_equal(read_motion("take.bvh", other).positions, read_motion("take.bvh", content).positions)
+    for same in (other, content.decode().encode("utf-16")):
+        np.testing.assert_array_equal(read_motion("x.bvh", same).positions, read_motion("x.bvh", content).positions)
 
 
 def test_a_description_says_what_a_file_does_not() -> None:

@@ -1,4 +1,5 @@
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import ezc3d
@@ -82,6 +83,59 @@ def test_a_trc_is_read_in_metres_and_z_up(unit: float, name: str) -> None:
     assert np.isnan(body[:, J["spine1"]]).all()
 
 
+@pytest.mark.parametrize("change", [
+    lambda rows: "\n".join(rows).encode("utf-16"),
+    lambda rows: "\r\n".join(rows).replace(".", ",").encode(),
+    lambda rows: "\n".join([*rows[:3], rows[3].replace("\tL", "\tAnna:L"), *rows[4:]]).encode(),
+    lambda rows: "\n".join([*rows[:2], rows[2].replace("mm", "millimeters"), *rows[3:]]).encode(),
+])  # fmt: skip
+def test_a_trc_is_read_however_its_program_writes_it(change: Callable[[list[str]], bytes]) -> None:
+    content = trc(points())
+    np.testing.assert_array_equal(
+        read_motion("x.trc", change(content.decode().split("\n"))).positions, read_motion("x.trc", content).positions
+    )
+
+
+def test_frames_that_a_trc_leaves_out_are_frames_without_points() -> None:
+    rows = trc(points(40)).replace(b"\t40\t17", b"\t30\t17").split(b"\n")
+    whole, body = (read_motion("x.trc", b"\n".join(r)).positions for r in (rows, [*rows[:16], *rows[26:]]))
+    assert len(body) == 40
+    assert np.isnan(body[10:20]).all()
+    np.testing.assert_array_equal(body[20:], whole[20:])
+    other = b"\n".join(rows).replace(b"60\t60", b"30\t30")
+    with pytest.raises(MotionError, match=r"DataRate of 30 Hz and times of 60 Hz: correct one .* fps with .*--rig"):
+        read_motion("x.trc", other)
+    fps, body = read_motion("x.trc", other, Description(fps=60.0))
+    assert fps == 60
+    np.testing.assert_array_equal(body, whole)
+
+
+def test_a_point_at_the_origin_is_missing(tmp_path: Path) -> None:
+    holed = points()
+    holed[1, list(HALPE).index("LWrist")] = 0.0
+    for name, content in (("x.trc", trc(holed)), ("x.c3d", c3d(tmp_path / "x.c3d", list(HALPE), 1000 * holed))):
+        missing = np.isnan(read_motion(name, content).positions[:, J["left_wrist"]]).all(axis=1)
+        assert missing.tolist() == [False, True, False, False]
+
+
+def test_points_of_several_subjects_are_told_apart(tmp_path: Path) -> None:
+    names = [f"{subject}:{name}" for subject in ("Anna", "Ben") for name in HALPE]
+    both = np.concatenate([points(), points() + [2.0, 0.0, 0.0]], axis=1)
+    del names[2]  # Anna lacks a knee
+    content = c3d(tmp_path / "x.c3d", names, 1000 * np.delete(both, 2, axis=1))
+    with pytest.raises(MotionError, match="expected one body, got points of Anna, Ben: export each body alone"):
+        read_motion("x.c3d", content)
+    _, body = read_motion("x.c3d", content, Description(canonical={"head": "Ben:Head"}, up="z"))
+    np.testing.assert_allclose(body[:, J["head"]], points()[:, list(HALPE).index("Head")] + [2, 0, 0], atol=1e-4)
+
+
+def test_a_c3d_may_have_more_than_255_points(tmp_path: Path) -> None:
+    names = [*(f"M{k}" for k in range(260)), *HALPE]
+    many = np.concatenate([np.ones((4, 260, 3)), points()], axis=1)
+    _, body = read_motion("x.c3d", c3d(tmp_path / "x.c3d", names, 1000 * many))
+    np.testing.assert_allclose(body[:, J["head"]], points()[:, list(HALPE).index("Head")], atol=1e-4)
+
+
 def test_a_file_that_is_cut_short_is_refused(tmp_path: Path) -> None:
     whole = c3d(tmp_path / "x.c3d", list(HALPE), 1000 * points(40))
     cut = {"take.trc": trc(points(40)).rpartition(b"\n")[0], "take.c3d": whole[: len(whole) * 7 // 10]}
@@ -116,6 +170,7 @@ def test_points_are_known_by_side_and_part_however_they_are_written() -> None:
     for names in (
         ["L_Hip", "R_Hip", "L_Shoulder", "R_Shoulder"],
         ["HIP_LEFT", "HIP_RIGHT", "leftShoulder", "rightShoulder"],
+        ["LHJC", "RHJC", "LSHOULDER", "rshoulder"],
     ):
         sided = {f"{side}_{part}" for side in ("left", "right") for part in ("hip", "shoulder")}
         table = recognise_points([*names, "l.ear", "r.ear", "nose"]).table
@@ -132,6 +187,11 @@ def test_arrays_need_to_be_described(tmp_path: Path) -> None:
     fps, body = read_motion("x.npy", buffer.getvalue(), Description(fps=25.0, metres=0.01))
     assert fps == 25
     np.testing.assert_allclose(body[0], REST_POSITIONS, atol=1e-9)
+
+
+def test_a_table_without_tabs_says_so() -> None:
+    with pytest.raises(MotionError, match=r"DataRate in the second line .*separated by tabs; got 'DataRate "):
+        read_motion("x.trc", trc(points()).replace(b"\t", b" "))
 
 
 @pytest.mark.parametrize("name", ["x.bvh", "x.trc", "x.c3d", "x.npy", "x.npz"])
