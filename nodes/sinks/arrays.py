@@ -42,6 +42,7 @@ _ROW = np.dtype(
     ]
 )
 _NEAREST = ("state", "anomaly_flag")
+_MOVING = ("positions", "world_positions", "rotations")
 
 
 class NpzCollector:
@@ -98,8 +99,8 @@ def _blank(shape: tuple[int, ...]) -> NDArray[np.void]:
 
 
 def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void]:
-    """One body's rows at other stamps: interpolated between neighbours of the grid, held for less than a period at
-    its ends."""
+    """One body's rows at other stamps: interpolated between neighbours of the grid. For less than a period beyond its
+    ends, the body moves on as in the last step, and for as long into a gap it is held."""
     grid = grid[np.unique(grid["stamp_ns"], return_index=True)[1]]
     after = np.searchsorted(grid["stamp_ns"], stamps_ns, side="right").clip(1, max(len(grid) - 1, 1))
     before, after = after - 1, np.minimum(after, len(grid) - 1)
@@ -107,11 +108,12 @@ def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void
     span = last - first
     fraction = (stamps_ns - first) / np.maximum(span, 1)
     nearest = np.where(np.abs(stamps_ns - first) <= np.abs(last - stamps_ns), before, after)
-    # in a gap of the grid, and at its ends, there is at most one neighbour
-    between = (span <= 1.5 * FRAME_NS) & (fraction >= 0) & (fraction <= 1)
+    # in a gap of the grid there is at most one neighbour; at its ends there are two, on the same side
+    adjacent = span <= 1.5 * FRAME_NS
+    between = adjacent & (fraction >= 0) & (fraction <= 1)
     known = between | (np.abs(grid["stamp_ns"][nearest] - stamps_ns) < FRAME_NS - SLACK_NS)
-    before, after = np.where(between, before, nearest), np.where(between, after, nearest)
-    fraction = np.where(between, fraction, 0.0)
+    before, after = np.where(adjacent, before, nearest), np.where(adjacent, after, nearest)
+    fraction = np.where(adjacent, fraction, 0.0)
 
     rows = _blank(stamps_ns.shape)
     for name in _ROW.names or ():
@@ -119,7 +121,8 @@ def _at(grid: NDArray[np.void], stamps_ns: NDArray[np.int64]) -> NDArray[np.void
         if name in _NEAREST:
             rows[name][known] = values[nearest][known]
         elif name != "stamp_ns":
-            weight = fraction.reshape(-1, *[1] * (values.ndim - 1))
+            share = fraction if name in _MOVING else fraction.clip(0.0, 1.0)
+            weight = share.reshape(-1, *[1] * (values.ndim - 1))
             a, b = values[before].astype(np.float64), values[after].astype(np.float64)
             mixed = _slerp(a, b, weight) if name == "rotations" else a + weight * (b - a)
             rows[name][known] = np.where(np.isnan(mixed), values[nearest], mixed)[known]
