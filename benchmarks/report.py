@@ -24,8 +24,8 @@ _LASTING = "measured before noise that lasts was denoised by HG-VAE too, which m
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            "contacts", "counter", "event_mocap", "events", "hidden_joints", "humor",
-            "latency", "layouts", "mediapipe", "restart", "retarget", "rotations",
+            "contacts", "event_mocap", "events", "hidden_joints", "humor",
+            "latency", "restart", "retarget", "rotations",
             "scale", "world",
         ),
         _LASTING,
