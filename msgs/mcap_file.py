@@ -88,6 +88,7 @@ class McapFile:
     Args:
         file: file opened for reading; it stays open.
         size: its size, bytes.
+        scan: whether to scan a file without a valid index.
 
     Attributes:
         channels: channels by id.
@@ -99,10 +100,10 @@ class McapFile:
         gaps: number of unreadable pieces.
 
     Raises:
-        ValueError: nothing in the file looks like MCAP.
+        ValueError: nothing in the file looks like MCAP, or it has no index and is not to be scanned.
     """
 
-    def __init__(self, file: IO[bytes], size: int) -> None:
+    def __init__(self, file: IO[bytes], size: int, *, scan: bool = True) -> None:
         self._file = file
         self._size = size
         self.channels: dict[int, Channel] = {}
@@ -117,6 +118,8 @@ class McapFile:
             indexed = begins and self._read_index()
         except BROKEN:
             indexed = False
+        if not indexed and not scan:
+            raise ValueError("it has no valid index")
         if not indexed:
             self._scan()
         if not begins and not self.places:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -32,6 +33,9 @@ CHUNK_BYTES = 2**18
 TAIL_NS = 10_000_000_000
 """Length of the last part's end that is searched for duplicates, nanoseconds. A killed recorder may receive again
 messages that it had written and not yet acknowledged."""
+SCAN_S = 5.0
+"""Longest time for which parts without an index are scanned when a recording goes on, seconds. On a machine that is
+switched off without notice there is one for each day; older ones count as empty in `metadata.yaml`."""
 METADATA = "metadata.yaml"
 
 
@@ -50,15 +54,6 @@ class PartInfo:
     last_ns: int = 0
     first_of: dict[str, int] = field(default_factory=dict)
     """log time of each topic's first message, nanoseconds"""
-
-    @classmethod
-    def of(cls, path: Path) -> PartInfo:
-        """Read the entries from an existing file; empty if it cannot be read."""
-        with path.open("rb") as file, suppress(*BROKEN):
-            mcap = McapFile(file, path.stat().st_size)
-            counts = Counter({c.topic.removeprefix("/"): mcap.counts[c.id] for c in mcap.channels.values()})
-            return cls(path, +counts, mcap.start_ns, mcap.end_ns)
-        return cls(path)
 
 
 class RecordingWriter(Closing):
@@ -97,8 +92,11 @@ class RecordingWriter(Closing):
             if go_on and self.directory.is_dir():
                 parts = recorded_parts(self.directory)
                 number = 1 + max(parts, default=-1)
-                self._done = [PartInfo.of(parts[n]) for n in sorted(parts)]
-                self._tail = _tail(parts[number - 1]) if parts else set()
+                until = time.monotonic() + SCAN_S
+                for n in sorted(parts, reverse=True):
+                    newest = n == number - 1
+                    scan = newest or time.monotonic() < until
+                    self._done.insert(0, _existing(parts[n], self._tail if newest else None, scan=scan))
             else:
                 self.directory.mkdir(parents=True)
             self._part = _Part(self.directory, number)
@@ -321,15 +319,20 @@ def recorded_parts(directory: Path) -> dict[int, Path]:
     return parts
 
 
-def _tail(part: Path) -> set[tuple[str, bytes]]:
-    """Topics and encoded bytes of a part's last messages; empty if it cannot be read."""
-    tail: set[tuple[str, bytes]] = set()
-    with part.open("rb") as file, suppress(*BROKEN):
-        mcap = McapFile(file, part.stat().st_size)
-        names = {channel.topic for channel in mcap.channels.values()}
-        for logged in mcap.messages(names, mcap.end_ns - TAIL_NS):
-            tail.add((logged.channel.topic.removeprefix("/"), bytes(logged.data)))
-    return tail
+def _existing(path: Path, tail: set[tuple[str, bytes]] | None, *, scan: bool) -> PartInfo:
+    """The entries of an existing part; empty if it cannot be read, or has no index and is not to be scanned.
+
+    ``tail`` receives the topics and encoded bytes of its last messages.
+    """
+    with path.open("rb") as file, suppress(*BROKEN):
+        mcap = McapFile(file, path.stat().st_size, scan=scan)
+        topics = {channel.id: channel.topic for channel in mcap.channels.values()}
+        if tail is not None:
+            for logged in mcap.messages(set(topics.values()), mcap.end_ns - TAIL_NS):
+                tail.add((logged.channel.topic.removeprefix("/"), bytes(logged.data)))
+        counts = Counter({topic.removeprefix("/"): mcap.counts[id] for id, topic in topics.items()})
+        return PartInfo(path, +counts, mcap.start_ns, mcap.end_ns)
+    return PartInfo(path)
 
 
 def definition(name: str) -> str:

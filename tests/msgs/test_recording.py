@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from tests.helpers.msg_strategies import ANY, EXAMPLES, raw
 
+from steadypose.msgs import recording_writer
 from steadypose.msgs.codec import DEFINITIONS, decode, encode, typestore, wire_type
 from steadypose.msgs.mcap_file import McapFile
 from steadypose.msgs.recording import Recorded, RecordingError, RecordingReader, RecordingWriter
@@ -384,6 +385,17 @@ def test_a_recording_goes_on_in_the_next_part(tmp_path: Path):
     assert len(before) > 60
     metadata = (directory / "metadata.yaml").read_text()
     assert f"message_count: {len(found)}\n" in metadata
+
+
+def test_parts_without_an_index_are_not_scanned_at_every_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    directory, scanned = tmp_path / "recording", []
+    scan = McapFile._scan
+    monkeypatch.setattr(McapFile, "_scan", lambda self: (scanned.append(self._file.name), scan(self)))
+    monkeypatch.setattr(recording_writer, "SCAN_S", 0.0)
+    for part in range(4):
+        killed = RecordingWriter(directory, go_on=True)
+        killed.write(POSE_RAW, raw(), part * 10**10)
+    assert [Path(name).name for name in scanned] == [f"recording_{number}.mcap" for number in range(3)]
 
 
 def test_what_the_last_part_holds_is_not_written_again(tmp_path: Path):
