@@ -6,11 +6,15 @@ it drops and counts messages. After a restart it continues with the next part.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import logging
 import math
 import os
 import shutil
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,6 +38,11 @@ CHECK_NS = 1_000_000_000
 """Interval between checks of the free disk space, nanoseconds."""
 QUIET_S = 0.3
 """Time without a message after which everything in flight has arrived, when the node stops, seconds."""
+LAST_NS = 2_000_000_000
+"""Longest time that a stopping node goes on recording publishers that do not stop, such as a tracker, nanoseconds."""
+WAITING = 1000
+"""Largest number of diagnostics kept until the first pose. The oldest are left out: no source may come for days."""
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 @dataclass(frozen=True)
@@ -165,21 +174,31 @@ class RecorderNode(Node):
         self._checked_ns = self._synced_ns = 0
         self._topics = frozenset(settings.topics)
         self._log_times = LogTimes()
-        self._before_first_pose: list[Diagnostics] = []
+        self._before_first_pose: deque[Diagnostics] = deque(maxlen=WAITING)
         self._pose_ns: int | None = None
         self._written = 0
+        self._writer: RecordingWriter | None = None
+
+    def run(self) -> None:
+        # before anything is received or reported, because the last part of a killed recorder is read through
+        try:
+            self._writer = self._settings.writer()
+        except RecordingError as error:
+            if not isinstance(error.__cause__, OSError) or error.__cause__.errno not in NO_SPACE:
+                raise
+            self._no_room(str(error))
+        super().run()
 
     def work(self) -> None:
-        self._writer = self._settings.writer()
         try:
             super().work()
-            while self.take_next(QUIET_S):
+            asked_ns = self.clock.monotonic_ns()
+            while self.take_next(QUIET_S) and self.clock.monotonic_ns() - asked_ns < LAST_NS:
                 pass
         finally:
-            try:
-                self._writer.close()
-            except OSError as error:
-                self._no_room(error.strerror or str(error))
+            with self._if_room():
+                if self._writer:
+                    self._writer.close()
 
     def take_next(self, timeout_s: float) -> bool:
         took = super().take_next(timeout_s)
@@ -189,14 +208,13 @@ class RecorderNode(Node):
         return took
 
     def _flush(self) -> None:
-        try:
-            self._writer.flush()
-        except OSError as error:
-            self._no_room(error.strerror or str(error))
+        with self._if_room():
+            if self._writer:
+                self._writer.flush()
 
     def settle(self, timeout_s: float = 0.0) -> bool:
         """As in every node, but a message is acknowledged only once it would survive this process."""
-        return False if self._writer.pending else super().settle(timeout_s)
+        return False if self._writer and self._writer.pending else super().settle(timeout_s)
 
     def handle(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
@@ -207,23 +225,20 @@ class RecorderNode(Node):
             return
         if not isinstance(message, Diagnostics):
             self._pose_ns = message.stamp_ns
-        waiting, self._before_first_pose = self._before_first_pose, []
-        for diagnostics in waiting:
-            self._write(DIAGNOSTICS, diagnostics, message.stamp_ns)
+        while self._before_first_pose:
+            self._write(DIAGNOSTICS, self._before_first_pose.popleft(), message.stamp_ns)
         # diagnostics of a node that has not received a pose have no stamp
         self._write(topic, message, message.stamp_ns or self._pose_ns or 0)
         if not isinstance(message, Diagnostics) and message.end_of_stream:
             self._flush()  # this process may be stopped as soon as the end of the stream is known
 
     def _write(self, topic: str, message: Message, stamp_ns: int) -> None:
-        self._look_at_disk()
-        if not self._full:
-            try:
+        with self._if_room():
+            self._look_at_disk()
+            if self._writer and not self._full:
                 self._writer.write(topic, message, self._log_times.next(topic, stamp_ns))
                 self._written += 1
                 return
-            except OSError as error:
-                self._no_room(error.strerror or str(error))
         self.health.counts[NO_ROOM] += 1
 
     def _look_at_disk(self) -> None:
@@ -231,20 +246,27 @@ class RecorderNode(Node):
         if self._checked_ns and now - self._checked_ns < CHECK_NS:
             return
         self._checked_ns = now
+        self._writer = self._writer or self._settings.writer()
+        free_mb = shutil.disk_usage(self._writer.directory).free / 1e6
+        least_mb = max(self._settings.free_mb, LEAST_FREE_MB)
+        if free_mb < least_mb:
+            self._no_room(f"{free_mb:.1f} MB of the disk are free, less than {least_mb:g} (free_mb)")
+        elif self._full:
+            self._writer.split()
+            self._full = False
+            logger.info("recorder: the disk has room again; the next part starts")
+        elif self._settings.sync_s and now - self._synced_ns >= self._settings.sync_s * 1e9:
+            self._synced_ns = now
+            self._writer.flush()  # the log times, by which it does so, stand still for hours if a clock was set back
+            self._writer.sync()
+
+    @contextmanager
+    def _if_room(self) -> Iterator[None]:
+        """Take what fails in the context for a full disk."""
         try:
-            free_mb = shutil.disk_usage(self._writer.directory).free / 1e6
-            least_mb = max(self._settings.free_mb, LEAST_FREE_MB)
-            if free_mb < least_mb:
-                self._no_room(f"{free_mb:.1f} MB of the disk are free, less than {least_mb:g} (free_mb)")
-            elif self._full:
-                self._writer.split()
-                self._full = False
-                logger.info("recorder: the disk has room again; the next part starts")
-            elif self._settings.sync_s and now - self._synced_ns >= self._settings.sync_s * 1e9:
-                self._synced_ns = now
-                self._writer.sync()
-        except OSError as error:
-            self._no_room(error.strerror or str(error))
+            yield
+        except (OSError, RecordingError) as error:
+            self._no_room(error.strerror or str(error) if isinstance(error, OSError) else str(error))
 
     def _no_room(self, cause: str) -> None:
         if not self._full:

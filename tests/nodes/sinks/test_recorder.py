@@ -1,5 +1,6 @@
 import errno
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -7,9 +8,12 @@ from unittest.mock import Mock
 import pytest
 from conftest import VirtualClock, walk
 
-from steadypose.msgs.recording import RecordingReader
-from steadypose.msgs.topics import POSE_RAW
-from steadypose.nodes.sinks.recorder import AHEAD_NS, NO_ROOM, LogTimes, RecorderNode
+from steadypose.msgs import recording_writer
+from steadypose.msgs.recording import RecordingError, RecordingReader
+from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
+from steadypose.msgs.types import Diagnostics, Level
+from steadypose.nodes.graph.node import Node
+from steadypose.nodes.sinks.recorder import AHEAD_NS, NO_ROOM, WAITING, LogTimes, RecorderNode
 from steadypose.nodes.sources.recording import end_of
 
 
@@ -53,6 +57,64 @@ def test_a_disk_that_is_full_before_it_was_noticed(tmp_path: Path, recorder: Rec
     assert 0 < recorder.health.counts[NO_ROOM] <= 30
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.count(POSE_RAW) > 30, "half a second before it at most is lost"
+
+
+@pytest.mark.parametrize(("cause", "waits"), [(errno.ENOSPC, True), (errno.EROFS, False)])
+def test_a_disk_that_is_full_at_the_start(tmp_path, make_launch, clock, free, monkeypatch, cause: int, waits: bool):
+    node = RecorderNode(make_launch(recorder__directory=tmp_path / "out"), clock)
+    monkeypatch.setattr(Node, "run", lambda self: None)
+    with monkeypatch.context() as full:
+        full.setattr(recording_writer, "_Part", Mock(side_effect=OSError(cause, "no")))
+        if not waits:  # but asks whoever started it for another folder
+            with pytest.raises(RecordingError, match="cannot record to"):
+                node.run()
+            return
+        node.run()
+        for frame in walk(90)[:30]:
+            node.handle(POSE_RAW, frame)
+    clock.time_ns += 1_100_000_000
+    for frame in walk(90)[30:]:
+        node.handle(POSE_RAW, frame)
+    assert node._writer
+    node._writer.close()
+    assert node.health.counts[NO_ROOM] == 30
+    with RecordingReader(tmp_path / "out") as reader:
+        assert (reader.complete, reader.count(POSE_RAW)) == (True, 60)
+
+
+def test_it_completes_the_recording_though_a_tracker_goes_on(tmp_path: Path, recorder, clock, monkeypatch) -> None:
+    frames = iter(walk(200))
+
+    def take_next(_: float) -> bool:
+        clock.time_ns += 33_000_000
+        recorder.handle(POSE_RAW, next(frames))
+        return True
+
+    monkeypatch.setattr(Node, "work", lambda self: None)
+    monkeypatch.setattr(recorder, "take_next", take_next)
+    recorder.work()
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.complete
+        assert reader.count(POSE_RAW) == 61
+
+
+def test_reports_before_the_first_pose_have_its_time_and_fill_no_memory(tmp_path: Path, recorder) -> None:
+    for number in range(3 * WAITING):
+        recorder.handle(DIAGNOSTICS, Diagnostics(0, "prior", Level.OK, str(number), {}))
+    recorder.handle(POSE_RAW, walk(1)[0])
+    recorder._writer.close()
+    with RecordingReader(tmp_path / "out") as reader:
+        found = [(ns, m.message) for _, ns, m in reader.messages([DIAGNOSTICS]) if isinstance(m, Diagnostics)]
+    assert found == [(walk(1)[0].stamp_ns, str(number)) for number in range(2 * WAITING, 3 * WAITING)]
+
+
+def test_a_clock_that_was_set_back_keeps_nothing_from_the_disk(tmp_path: Path, recorder, clock) -> None:
+    for index, frame in enumerate(walk(300)):
+        clock.time_ns += 33_000_000
+        back_ns = 7200 * 10**9 * (index > 100)
+        recorder.handle(POSE_RAW, replace(frame, stamp_ns=frame.stamp_ns + 10**13 - back_ns, bodies=[]))
+    with RecordingReader(tmp_path / "out") as reader:
+        assert reader.count(POSE_RAW) >= 300 - 5.1 / 0.033
 
 
 @pytest.mark.parametrize(("stamps", "expected"), [
