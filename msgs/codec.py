@@ -24,6 +24,8 @@ MAX_BODIES = 128
 MAX_EVENTS = 16 * MAX_BODIES
 MAX_VALUES = 1000
 """Largest number of entries in one node's diagnostics."""
+MAX_NAME = 1024
+"""Largest size of a name (source, frame, layout) in UTF-8, bytes. Every node remembers a thousand sources."""
 
 _HEADER = "iIs"
 # the fields before the limited count, by struct's format characters with s for a string; and the limit
@@ -38,12 +40,12 @@ _BEFORE = {
 
 
 def check_size(topic: str, payload: bytes | memoryview) -> None:
-    """Check the number of bodies, events or values in an encoded message before it is decoded.
+    """Check the number of bodies, events or values in an encoded message, and its names, before it is decoded.
 
     A megabyte of bodies without joints would take seconds to decode, and would block all other messages.
 
     Raises:
-        ValueError: the number exceeds the limit.
+        ValueError: a number exceeds its limit.
     """
     before, most = _BEFORE[topic]
     order = "<" if len(payload) > 1 and payload[1] & 1 else ">"
@@ -55,6 +57,8 @@ def check_size(topic: str, payload: bytes | memoryview) -> None:
             at += -at % size
             if kind == "s":
                 (length,) = struct.unpack_from(f"{order}I", data, at)
+                if length > MAX_NAME + 1 and topic != DIAGNOSTICS:  # with its zero byte
+                    raise ValueError(f"expected names of at most {MAX_NAME} bytes, got {length - 1}")
                 at += length
             at += size
         at += -at % 4

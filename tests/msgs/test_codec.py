@@ -2,6 +2,7 @@ import contextlib
 import dataclasses
 import struct
 import tracemalloc
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -138,6 +139,14 @@ def test_more_than_a_message_may_hold_is_refused_before_it_is_decoded(topic: str
 
 ORIENTATION = np.array([0.1, -0.2, 0.3, 0.9])
 """x, y, z, w: no two alike, so that no order is another's."""
+
+
+@pytest.mark.parametrize("field", ["frame_id", "source", "skeleton"])
+def test_a_name_has_a_limit(field: str):
+    for size in (1024, 1025):
+        payload = encode(dataclasses.replace(raw(), **{field: "n" * size}))
+        with pytest.raises(DecodeError, match="at most 1024 bytes, got 1025") if size > 1024 else nullcontext():
+            decode(POSE_RAW, payload)
 
 
 @pytest.mark.parametrize("topic", [POSE_RAW, POSE_CLEAN, POSE_WORLD])
