@@ -20,7 +20,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from steadypose.nodes.settings import LaunchError
@@ -64,6 +64,7 @@ class WebServer:
         self._token, self._greeting = token, greeting
         self._clients: set[_Client] = set()
         self._latest: dict[str, str] = {}
+        self._faults: set[str] = set()
         self.dropped = 0
         self._names = own_names(host, *names)
         started: Future[Server] = Future()
@@ -100,6 +101,7 @@ class WebServer:
 
         logging.getLogger("websockets").setLevel(logging.WARNING)  # it logs every connection
         self._loop, self._closing = asyncio.get_running_loop(), asyncio.Event()
+        self._loop.set_exception_handler(self._log_once)
         try:
             # clients send nothing; no compression, because it takes 300 kB per client and most are on this machine
             server = await serve(
@@ -112,6 +114,12 @@ class WebServer:
         async with server:
             started.set_result(server)
             await self._closing.wait()
+
+    def _log_once(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log the first fault of its kind. Without a free file descriptor, asyncio reports a hundred in a second."""
+        if context["message"] not in self._faults:
+            self._faults.add(context["message"])
+            loop.default_exception_handler(context)
 
     async def _talk(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed
