@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -149,7 +150,8 @@ class Relay:
     def _keep(self, progress: Progress) -> None:
         if not self._supervisor:
             return
-        if self._file is None:
-            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
         form = _FORM.pack(self._supervisor, progress.publisher, *progress.sequence, *progress.mark)
-        os.pwrite(self._file, form, 0)
+        with suppress(OSError):  # on a full disk, a successor knows less; it starts anew, or repeats what is known
+            if self._file is None:
+                self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            os.pwrite(self._file, form, 0)

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import secrets
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,12 +110,14 @@ class WebNode(Node):
 
 
 def kept_token(file: Path) -> str:
-    """The token in a file that only this user can read; created on first use."""
+    """The token in a file that only this user can read; created on first use. On a full disk, it is not kept."""
     with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), "r+") as kept:
         fcntl.flock(kept, fcntl.LOCK_EX)
         token = kept.read()
         if not token:  # it is new, or the disk was full
-            kept.write(token := secrets.token_urlsafe(24))
+            token = secrets.token_urlsafe(24)
+            with suppress(OSError):
+                os.write(kept.fileno(), token.encode())
     return token
 
 

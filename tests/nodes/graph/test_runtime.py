@@ -1,8 +1,12 @@
+import errno
+import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, cycle
+from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +22,7 @@ from steadypose.nodes.graph.events_node import EventsNode, EventStream
 from steadypose.nodes.graph.health import Health
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
+from steadypose.nodes.graph.relay import Relay
 from steadypose.nodes.graph.topology import POSE_NODES, publishers
 from steadypose.nodes.sources.pose_input import PoseInputNode
 from steadypose.prior.events.detector import EventSettings
@@ -268,3 +273,10 @@ def test_the_node_publishes_what_the_trajectory_node_makes_known(make_launch: Ca
             return any(event.kind == EventKind.STANDS for event in events)
 
         until(stands)
+
+
+def test_progress_that_cannot_be_written_stops_no_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "pwrite", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    with Publisher(f"ipc://{tmp_path}/at") as publisher:
+        Relay(tmp_path / "progress", (POSE_RAW,), supervisor=1).begin(publisher)
+    assert Relay(tmp_path / "progress", (POSE_RAW,), supervisor=1).resume is None

@@ -1,5 +1,7 @@
+import errno
 import http.client
 import json
+import os
 import secrets
 import socket
 import stat
@@ -8,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -139,6 +142,13 @@ def test_there_are_no_more_clients_than_there_is_room_for_and_one_server_at_a_po
         WebServer("127.0.0.1", server.port, [], TOKEN, hello())
 
 
+def test_what_fails_again_and_again_is_logged_once(server: WebServer, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(100):  # as asyncio does without a free file descriptor
+        server._loop.call_soon_threadsafe(server._loop.call_exception_handler, {"message": "out of system resource"})
+    assert get(server, "/")[0] == 200
+    assert [record.message for record in caplog.records] == ["out of system resource"]
+
+
 def test_messages_as_json() -> None:
     names = json.loads(hello())
     assert names["states"][JointState.IMPUTED] == "IMPUTED"
@@ -168,6 +178,12 @@ def test_the_token_is_kept_where_only_this_user_reads(tmp_path: Path, found_no_r
     assert len(token) >= 32
     assert kept_token(tmp_path / "token") == token
     assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
+
+
+def test_on_a_full_disk_a_token_is_drawn_and_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "write", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    assert len(kept_token(tmp_path / "token")) >= 32
+    assert not (tmp_path / "token").read_text()
 
 
 def test_nodes_that_start_at_once_draw_one_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
