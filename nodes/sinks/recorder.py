@@ -25,7 +25,7 @@ from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
-from steadypose.nodes.settings import LaunchError, path_setting
+from steadypose.nodes.settings import LaunchError, as_text, path_setting
 from steadypose.nodes.sources.registry import open_input
 from steadypose.nodes.sources.source import LiveSource
 from steadypose.prior.settings import nearest
@@ -274,4 +274,4 @@ class RecorderNode(Node):
         self._full = True
 
     def status(self) -> dict[str, str]:
-        return {"written": str(self._written), "recording": self._settings.directory}
+        return {"written": str(self._written), "recording": as_text(self._settings.directory)}

@@ -9,6 +9,7 @@ import pytest
 from conftest import VirtualClock, walk
 
 from steadypose.msgs import recording_writer
+from steadypose.msgs.codec import encode
 from steadypose.msgs.recording import RecordingError, RecordingReader
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
 from steadypose.msgs.types import Diagnostics, Level
@@ -96,6 +97,11 @@ def test_it_completes_the_recording_though_a_tracker_goes_on(tmp_path: Path, rec
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.complete
         assert reader.count(POSE_RAW) == 61
+
+
+def test_a_folder_whose_name_is_no_utf_8_is_reported(recorder: RecorderNode) -> None:
+    recorder._settings = replace(recorder._settings, directory="/caf\udce9")
+    assert b"/caf\\xe9\0" in encode(Diagnostics(0, "recorder", Level.OK, "", recorder.status()))
 
 
 def test_reports_before_the_first_pose_have_its_time_and_fill_no_memory(tmp_path: Path, recorder) -> None:
