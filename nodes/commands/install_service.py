@@ -55,6 +55,8 @@ OOMPolicy=continue
 User={user}
 {groups}RuntimeDirectory={name}
 RuntimeDirectoryMode=0700
+# what subscribes or has the page open knows keys and a token there
+RuntimeDirectoryPreserve=restart
 CacheDirectory={name}
 StateDirectory={name}
 StateDirectoryMode=0750

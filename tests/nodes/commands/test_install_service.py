@@ -41,7 +41,13 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     assert (quoted("/a b"), quoted('100%$"')) == ('"/a b"', '"100%%$$\\""')
     text = service(user="daemon", command=Path("/bin/true")).unit()
     assert 'ExecStart=/bin/true run "/etc/poses/my launch.toml"' in text
-    for line in ("StateDirectory=poses", "SupplementaryGroups=video", "ProtectHome=yes", "OOMPolicy=continue"):
+    for line in (
+        "StateDirectory=poses",
+        "RuntimeDirectoryPreserve=restart",
+        "SupplementaryGroups=video",
+        "ProtectHome=yes",
+        "OOMPolicy=continue",
+    ):
         assert line in text
     if shutil.which("systemd-analyze"):
         unit = tmp_path / "poses.service"
