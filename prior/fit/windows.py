@@ -82,7 +82,6 @@ def fit_track(
     settings: FitSettings,
     folder: Path | None = None,
     *,
-    stages: int = 3,
     advanced: Callable[[], None] = lambda: None,
 ) -> FittedTrack:
     """Fit all windows of a track, as `fit_window`. ``folder`` is a cache of fitted windows, keyed by a digest of
@@ -99,14 +98,14 @@ def fit_track(
             starts = [replace(start, offsets=bones, ground=ground) for start in starts]
         parts = [_grounded(_between(start, first, last)) for start in starts]
         seen = [observed.between(first, last) for observed in track.observed]
-        path = folder and folder / f"{number:05d}-{_fingerprint(model, parts, seen, settings, anchor, stages)}.npz"
+        path = folder and folder / f"{number:05d}-{_fingerprint(model, parts, seen, settings, anchor)}.npz"
         found = _stored(path)
         if found is None:
-            tried = [fit_window(model, part, seen, settings, anchor=anchor, stages=stages) for part in parts]
-            best = min(tried, key=lambda fitted: fitted.energies[-1])
-            starts = [starts[tried.index(best)]]
-            found = _arrays(best, seen)
+            tried = [fit_window(model, part, seen, settings, anchor=anchor) for part in parts]
+            best = min(range(len(tried)), key=lambda which: tried[which].energies[-1])
+            found = {**_arrays(tried[best], seen), "start": np.array(best)}
             _store(path, found)
+        starts = [starts[int(found["start"])]]
         done.append(found)
         advanced()
     return _joined(done, bounds)

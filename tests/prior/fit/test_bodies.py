@@ -391,13 +391,13 @@ def test_smoothness_yields_to_what_a_joint_does_and_not_to_a_jump() -> None:
     torch.testing.assert_close(smooth.sigma, expected, rtol=1e-3, atol=0.0)
 
 
-def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(windows, "FRAMES", 8)
     monkeypatch.setattr(windows, "OVERLAP", 2)
-    given: list[tuple[Start, Any, Any, int]] = []
+    given: list[tuple[Start, Any, Any]] = []
 
-    def fit(model: Any, start: Start, seen: Any, settings: Any, *, anchor: Any, stages: int) -> Any:
-        given.append((start, seen[0], anchor, stages))
+    def fit(model: Any, start: Start, seen: Any, settings: Any, *, anchor: Any) -> Any:
+        given.append((start, seen[0], anchor))
         return SimpleNamespace(energies=(9.0, float(start.root[0, 0])), frames=len(start.root), number=len(given))
 
     def arrays(fitted: Any, seen: Any) -> dict[str, Any]:
@@ -410,15 +410,15 @@ def test_bodies_are_fitted_where_the_window_before_has_ended(monkeypatch: pytest
     seen = SeenJoints(torch.arange(14 * 66).reshape(14, 22, 3).float(), torch.ones(14, 22))
     told: list[int] = []
     settings, model = FitSettings(), cast(Any, torch.nn.Linear(1, 1))
-    windows.fit_track(
-        model, windows.Track(starts, [seen]), settings, stages=2, advanced=lambda: told.append(len(given))
-    )
+    track = windows.Track(starts, [seen])
+    windows.fit_track(model, track, settings, tmp_path, advanced=lambda: told.append(len(given)))
     assert told == [2, 3], "the second window only from the better start"
-    assert [stages for *_, stages in given] == [2, 2, 2]
-    start, joints, anchor, _ = given[2]
+    start, joints, anchor = given[2]
     np.testing.assert_array_equal(start.root.numpy(), roots[6:14])
     np.testing.assert_array_equal(joints.positions.numpy(), seen.positions[6:14].numpy())
     assert (start.offsets == 2.0).all()
     assert start.ground == 2.0
     np.testing.assert_array_equal(anchor.joints.numpy(), np.full((2, 22, 3), 2.0))
     assert given[0][2] is given[1][2] is None
+    windows.fit_track(model, track, settings, tmp_path)
+    assert len(given) == 3, "an interrupted fit resumes from the start that was the better one"
