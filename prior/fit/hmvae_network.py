@@ -11,7 +11,6 @@ of the first edge, then of the second, and so on, over time.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -145,37 +144,12 @@ def _kl(mean: Tensor, log_var: Tensor) -> Tensor:
     return (0.5 * (mean.square() + log_var.exp() - 1.0 - log_var).sum(dim=-1)).mean()
 
 
-class MotionVAE(nn.Module, ABC):
+class HMVAE(nn.Module):
     """A VAE of windows (B, T, 22, 6) of local 6D rotations (the root's is its orientation), T = ``window``."""
 
-    def __init__(self, window: int) -> None:
-        super().__init__()
-        self.window = window
-
-    @abstractmethod
-    def encode(self, x: Tensor) -> Posterior:
-        """The posterior of windows x (B, T, 22, 6)."""
-
-    @abstractmethod
-    def decode(self, local: Tensor, deep: Tensor) -> Tensor:
-        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, edges, d) and z_g (B, edges, d)."""
-
-    def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6) of `decode`'s output, where that is about something observed in windows x."""
-        return decoded
-
-    def reconstruct(self, x: Tensor) -> Tensor:
-        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
-        posterior = self.encode(x)
-        return self.placed(self.decode(posterior.local_mean, posterior.global_mean), x)
-
-
-class HMVAE(MotionVAE):
-    """The hierarchical one: skeleton convolutions, a local and a global latent."""
-
     def __init__(self, config: HMVAEConfig) -> None:
-        super().__init__(config.window)
-        self.config = config
+        super().__init__()
+        self.config, self.window = config, config.window
         self.levels = pooling_levels(PARENTS)
         steps = self.steps = config.steps
         c = CHANNELS
@@ -204,6 +178,11 @@ class HMVAE(MotionVAE):
             )
             for k, level in reversed(list(enumerate(self.levels)))
         )
+
+    def reconstruct(self, x: Tensor) -> Tensor:
+        """Decode the posterior's mean: what refinement does with each window (equations 10 and 11)."""
+        posterior = self.encode(x)
+        return self.placed(self.decode(posterior.local_mean, posterior.global_mean), x)
 
     def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
         """Windows (B, T, 22, 6): the deviations decoded from the mean pose of windows x, if it is about that."""
