@@ -56,18 +56,12 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class Board:
-    """A ChArUco board: a chessboard with markers in its white squares.
+    """A ChArUco board: a chessboard with markers in its white squares."""
 
-    Attributes:
-        columns, rows: numbers of squares.
-        square: metres, side of a square, measured on the print.
-        marker: side of a marker as a share of a square's side.
-    """
-
-    columns: int = 7
+    columns: int = 7  # numbers of squares
     rows: int = 5
-    square: float = 0.056
-    marker: float = 0.75
+    square: float = 0.056  # metres, side of a square, measured on the print
+    marker: float = 0.75  # side of a marker as a share of a square's side
 
     def __post_init__(self) -> None:
         if not (3 <= self.columns <= 20 and 3 <= self.rows <= 20 and 0.005 <= self.square <= 1.0):
@@ -207,18 +201,12 @@ def calibrate_lens(views: Sequence[Corners], size: tuple[int, int]) -> Intrinsic
 
 @dataclass(frozen=True)
 class Placement:
-    """Extrinsics of a camera.
+    """Extrinsics of a camera."""
 
-    Attributes:
-        pose: pose of its optical frame in the world.
-        error_px: 80th percentile of the corners' reprojection error, pixels.
-        sigma_m, sigma_rad: standard deviations of position and orientation along the worst axis.
-    """
-
-    pose: Pose
-    error_px: float
-    sigma_m: float
-    sigma_rad: float
+    pose: Pose  # of its optical frame in the world
+    error_px: float  # 80th percentile of the corners' reprojection error, pixels
+    sigma_m: float  # metres, standard deviation of the position along the worst axis
+    sigma_rad: float  # radians, standard deviation of the orientation about the worst axis
 
 
 def camera_pose(views: Sequence[Corners], lens: Intrinsics) -> Placement:

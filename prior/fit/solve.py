@@ -46,38 +46,28 @@ of the energy expected of their noise. Chosen on validation people (benchmarks/N
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Steps of each stage and standard deviation of each term, chosen on validation people.
+    """Steps of each stage and standard deviation of each term, chosen on validation people."""
 
-    Attributes:
-        root_steps, pose_steps, motion_steps: numbers of L-BFGS steps, with up to five evaluations each.
-        smooth_sigma: m/s², of `Smooth` in stages 1 and 2.
-        acceleration_share: ratio of the standard deviation of a joint's accelerations to its initial ones nearby, added
-            to ``smooth_sigma`` in squares; 0 if the initial poses shake.
-        pose_sigma: of `FirstState` as a prior of all states in stage 2.
-        transitions: the transition term of stage 3.
-        first_sigma: of `FirstState` as a prior of all states in stage 3.
-        motion_smooth_sigma: m/s², of `Smooth` in stage 3, against jitter that the motion model allows.
-        standing: the contact term of stage 3.
-        discrepancy: as `DISCREPANCY`; infinite to keep stage 3 always.
-        bones_sigma: metres, of `Bones`.
-        ground_height_sigma: metres, of `Ground` if the ground is unknown.
-        ground_tilt_sigma: radians, of `Ground` if the ground is unknown.
-    """
-
+    # numbers of L-BFGS steps, with up to five evaluations each
     root_steps: int = 30
     pose_steps: int = 100
     motion_steps: int = 100
-    smooth_sigma: float = 4.0
+    # stages 1 and 2
+    smooth_sigma: float = 4.0  # m/s², of `Smooth`
     acceleration_share: float = 2.0
-    pose_sigma: float = 12.0
+    """ratio of the standard deviation of a joint's accelerations to its initial ones nearby, added to ``smooth_sigma``
+    in squares; 0 if the initial poses shake"""
+    pose_sigma: float = 12.0  # of `FirstState` as a prior of all states
+    # stage 3
     transitions: Transitions = field(default_factory=Transitions)
-    first_sigma: float = 6.0
-    motion_smooth_sigma: float = 8.0
+    first_sigma: float = 6.0  # of `FirstState` as a prior of all states
+    motion_smooth_sigma: float = 8.0  # m/s², of `Smooth`, against jitter that the motion model allows
     standing: Standing = field(default_factory=Standing)
-    discrepancy: float = DISCREPANCY
-    bones_sigma: float = 0.01
-    ground_height_sigma: float = 0.05
-    ground_tilt_sigma: float = 0.03
+    discrepancy: float = DISCREPANCY  # as there; infinite to keep this stage always
+    # all stages
+    bones_sigma: float = 0.01  # metres, of `Bones`
+    ground_height_sigma: float = 0.05  # metres, of `Ground` if the ground is unknown
+    ground_tilt_sigma: float = 0.03  # radians, likewise
 
 
 PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, acceleration_share=0.0, pose_sigma=4.0)

@@ -57,22 +57,14 @@ FORGOTTEN_S = 60.0
 
 @dataclass
 class Level:
-    """A horizontal surface above the floor.
+    """A horizontal surface above the floor."""
 
-    Attributes:
-        height: metres, world.
-        variance: m², variance of the height.
-        low, high: (2,) metres, world, corners of the area where feet have stood.
-        stood_s: seconds for which feet have stood on it.
-        idle_s: seconds for which feet have stood elsewhere since.
-    """
-
-    height: float
-    variance: float
-    low: Floats
+    height: float  # metres, world
+    variance: float  # m², of the height
+    low: Floats  # (2,) metres, world, corners of the area where feet have stood
     high: Floats
-    stood_s: float = 0.0
-    idle_s: float = 0.0
+    stood_s: float = 0.0  # seconds for which feet have stood on it
+    idle_s: float = 0.0  # seconds for which feet have stood elsewhere since
 
     def reaches(self, place: Floats) -> bool:
         """Whether feet have stood on it long enough and it lies under or near a place (2,)."""

@@ -36,31 +36,23 @@ _FOOT, _FOOT_ERROR, _FOOT_RATE, _OF_FOOT = 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class BodyNoise:
-    """Process noise of root and feet, and correlation times of measurement errors.
+    """Process noise of root and feet, and correlation times of measurement errors."""
 
-    Attributes:
-        acceleration: m/s² over √Hz, density of the white-noise acceleration of a root at rest.
-        acceleration_at_speed: 1/√s, increase of that density for each m/s of the root's speed.
-        rest, load, swing: metres over √s, densities of the random walk of a foot that rests, of a foot that rolls under
-            load, and of a foot in the air.
-        slip_at_speed: s/m, relative increase of the random walk of feet at rest and under load for each m/s of the
-            root's speed. Such feet roll and slide, or are wrongly taken to stand.
-        sensor_rate: 1/s, w of the sensor's errors of a point at rest.
-        sensor_memory_m: metres of travel with which a moving root's error decays in addition, as a camera's error does.
-        network_memory_s: (3,) or a number, seconds, time constant of the network's error, a Gauss-Markov process.
-        first_speed: m/s, standard deviation of a root's first velocity.
-    """
-
-    acceleration: float = 3.0
-    acceleration_at_speed: float = 1.0
+    acceleration: float = 3.0  # m/s² over √Hz, density of the white-noise acceleration of a root at rest
+    acceleration_at_speed: float = 1.0  # 1/√s, increase of that density for each m/s of the root's speed
+    # metres over √s, densities of the random walk of a foot that rests, that rolls under load, and that is in the air
     rest: float = 0.006
     load: float = 0.2
     swing: float = 4.0
     slip_at_speed: float = 0.5
-    sensor_rate: float = 12.0
+    """s/m, relative increase of the random walk of feet at rest and under load for each m/s of the root's speed. Such
+    feet roll and slide, or are wrongly taken to stand"""
+    sensor_rate: float = 12.0  # 1/s, w of the sensor's errors of a point at rest
     sensor_memory_m: float = 0.03
+    """metres of travel with which a moving root's error decays in addition, as a camera's error does"""
     network_memory_s: ArrayLike = 0.15
-    first_speed: float = 1.0
+    """(3,) or a number, seconds, time constant of the network's error, a Gauss-Markov process"""
+    first_speed: float = 1.0  # m/s, standard deviation of a root's first velocity
 
     def density(self, speed: float) -> float:
         """Power spectral density of the white-noise acceleration of a root at ``speed`` m/s, in m²/s³."""

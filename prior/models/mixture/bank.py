@@ -20,8 +20,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import PARENTS
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.mixture.tracks import (
@@ -67,60 +67,35 @@ _HISTORY = 7
 
 
 class Bank(NamedTuple):
-    """State of S bodies, J joints in J tracks, M smoothers and K frames (the delay and the newest).
+    """State of S bodies, J joints in J tracks, M smoothers and K frames (the delay and the newest)."""
 
-    The first eight attributes belong to tracks, the others to joints.
-
-    Attributes:
-        position: (S, J, M, K, 3) metres, position in each frame given all measurements so far.
-        variance: (S, J, M, K) metres² along an axis, variance of the position.
-        with_position, with_velocity: (S, J, M, K) covariance of each frame's position with the newest position and
-            velocity.
-        velocity: (S, J, M, 3) m/s, and ``velocity_variance`` (S, J, M).
-        squared_innovations: (S, J, M) sums, with forgetting, of the squared innovations normalised by their variance.
-        log_variances: (S, J, M) sums, with forgetting, of the logarithms of the innovations' variance.
-        observations: (S, J) number of observations in these sums, with forgetting.
-        raw: (S, J, K, 3) metres, the raw position, or the last one while unobserved; NaN before the first.
-        unseen: (S, J, K) frames since the joint was last observed; -1 before the first observation.
-        confidence: (S, J, K) confidence of the observation.
-        recent: (S, J, 7, 3) metres, raw positions of the last frames; NaN where unobserved.
-        distances: (S, J, M, 2) metres², running means of the squared distances between neighbouring experts.
-        noise: (S, J) metres², running mean of the squared distance from the raw joint to `features.NOISE_EXPERT`.
-        sizes: (S, J, 4) running means of the logarithms of the differences of `LAGS`.
-        length: (S, J, 2) metres and metres², running mean and variance of the length of each joint's bone.
-        place: (S, J, 3) metres, pose in the frame that was last described; NaN before.
-        age: (S, J, 3) number of frames in the running means of experts, differences and bones.
-        heading: (S, 2) cosine and sine of the body's heading.
-        modes: (S, J, J) orthogonal matrix, joints by tracks: joints are ``modes @ tracks``.
-        eigenvalue: (S, J) variance of each track's acceleration, relative to the joints' mean.
-        member: (S, J) 1 if a joint is in the body's modes, 0 if it is a track of its own.
-        streak: (S, J) number of consecutive frames in which a joint was observed.
-    """
-
-    position: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    with_position: NDArray[np.float64]
-    with_velocity: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    velocity_variance: NDArray[np.float64]
-    squared_innovations: NDArray[np.float64]
-    log_variances: NDArray[np.float64]
-    observations: NDArray[np.float64]
-    raw: NDArray[np.float64]
-    unseen: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-    recent: NDArray[np.float64]
-    distances: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-    length: NDArray[np.float64]
-    place: NDArray[np.float64]
-    age: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    modes: NDArray[np.float64]
-    eigenvalue: NDArray[np.float64]
-    member: NDArray[np.float64]
-    streak: NDArray[np.float64]
+    # of tracks
+    position: Floats  # (S, J, M, K, 3) metres, position in each frame given all measurements so far
+    variance: Floats  # (S, J, M, K) metres² along an axis, variance of the position
+    with_position: Floats  # (S, J, M, K) covariance of each frame's position with the newest position
+    with_velocity: Floats  # (S, J, M, K) covariance of each frame's position with the newest velocity
+    velocity: Floats  # (S, J, M, 3) m/s
+    velocity_variance: Floats  # (S, J, M)
+    squared_innovations: Floats  # (S, J, M) sums, with forgetting, of squared innovations over their variances
+    log_variances: Floats  # (S, J, M) sums, with forgetting, of the logarithms of the innovations' variances
+    observations: Floats  # (S, J) number of observations in these sums, with forgetting
+    # of joints
+    raw: Floats  # (S, J, K, 3) metres, the raw position, or the last one while unobserved; NaN before the first
+    unseen: Floats  # (S, J, K) frames since the joint was last observed; -1 before the first observation
+    confidence: Floats  # (S, J, K) confidence of the observation
+    recent: Floats  # (S, J, 7, 3) metres, raw positions of the last frames; NaN where unobserved
+    distances: Floats  # (S, J, M, 2) metres², running means of the squared distances between neighbouring experts
+    noise: Floats  # (S, J) metres², running mean of the squared distance from the raw joint to `features.NOISE_EXPERT`
+    sizes: Floats  # (S, J, 4) running means of the logarithms of the differences of `LAGS`
+    length: Floats  # (S, J, 2) metres and metres², running mean and variance of the length of each joint's bone
+    place: Floats  # (S, J, 3) metres, pose in the frame that was last described; NaN before
+    age: Floats  # (S, J, 3) number of frames in the running means of experts, differences and bones
+    # of bodies and their modes
+    heading: Floats  # (S, 2) cosine and sine of the body's heading
+    modes: Floats  # (S, J, J) orthogonal matrix, joints by tracks: joints are ``modes @ tracks``
+    eigenvalue: Floats  # (S, J) variance of each track's acceleration, relative to the joints' mean
+    member: Floats  # (S, J) 1 if a joint is in the body's modes, 0 if it is a track of its own
+    streak: Floats  # (S, J) number of consecutive frames in which a joint was observed
 
 
 def new_bank(bodies: int, delay: int) -> Bank:
@@ -156,7 +131,7 @@ def new_bank(bodies: int, delay: int) -> Bank:
     return bank
 
 
-def forget(bank: Bank, slot: NDArray[np.bool_]) -> None:
+def forget(bank: Bank, slot: Bools) -> None:
     """Forget the bodies in these slots (S,)."""
     for values in bank:
         values[slot] = 0.0

@@ -247,7 +247,7 @@ def _write_vector(heading, x, y, z, unit, features, at):
     features[at + 2] = np.arcsinh(z / unit)
 
 
-# Each function writes one group of a joint's features. None takes the whole bank: compiling its 19 arrays takes a
+# Each function writes one group of a joint's features. None takes the whole bank: compiling its many arrays takes a
 # second.
 
 
