@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats, medians
+from steadypose.prior.arrays import Bools, Floats, medians
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
 from steadypose.prior.body.skeleton import (
@@ -111,7 +111,7 @@ _TRUNKS = ((J["pelvis"], (J["left_hip"],)), (J["spine3"], (J["neck"], J["left_co
 _ON_TRUNK = sorted({int(end) for _, joints in _TRUNKS for joint in joints for end in (joint, MIRROR[joint])})
 
 
-def _bones(seen: NDArray[np.bool_]) -> list[list[int]]:
+def _bones(seen: Bools) -> list[list[int]]:
     """Return the measurable bones, given the joints (22,) that were ever ``seen``.
 
     Each bone is the path of joints from an observed joint up to, but without, its nearest observed ancestor.
@@ -134,7 +134,7 @@ def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
     return list(pairs.values())
 
 
-def _place_on_trunk(positions: Floats, seen: NDArray[np.bool_], offsets: Floats, weight: float) -> Floats:
+def _place_on_trunk(positions: Floats, seen: Bools, offsets: Floats, weight: float) -> Floats:
     """Return offsets (22, 3) with hips, neck and collars moved by ``weight`` towards the samples (T, 22, 3)."""
     placed = offsets.copy()
     world = global_rotations(solve_rotations(positions, offsets))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import Pose
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import BONES_BETWEEN, JOINTS, PARENTS, J, finite_joints
 from steadypose.prior.compiled import njit
 
@@ -243,7 +243,7 @@ def rigid_alignment(source: NDArray[np.floating], target: NDArray[np.floating]) 
     return rotation, centre_b - rotation @ centre_a
 
 
-def label_contacts(positions: NDArray[np.floating], fps: float, speed: float = REST_SPEED) -> NDArray[np.bool_]:
+def label_contacts(positions: NDArray[np.floating], fps: float, speed: float = REST_SPEED) -> Bools:
     """Label contacts (T, 8) of `CONTACT_JOINTS` from motion (T, 22, 3) metres, world, floor at z = 0: joints that are
     low, and slower than ``speed`` m/s (`REST_SPEED` or `LOAD_SPEED`).
 

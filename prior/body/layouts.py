@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import JOINTS, J, finite_joints
 
 if sys.version_info >= (3, 11):
@@ -67,7 +68,7 @@ class Skeleton:
     """canonical joints that are only about where the table has them"""
 
     @cached_property
-    def to_canonical(self) -> NDArray[np.float64]:
+    def to_canonical(self) -> Floats:
         """(22, J) weights; each row sums to 1, or to 0 if the sensor lacks the joint."""
         matrix = np.zeros((len(JOINTS), len(self.joints)))
         for joint, source in self.table.items():
@@ -78,12 +79,12 @@ class Skeleton:
         return matrix
 
     @cached_property
-    def sigma(self) -> NDArray[np.float64]:
+    def sigma(self) -> Floats:
         """(22,) metres along an axis, error of the mapping: of joints that are interpolated, 0 of others."""
         return np.where([joint in self.interpolated for joint in JOINTS], INTERPOLATED_SIGMA, 0.0)
 
     @cached_property
-    def observable(self) -> NDArray[np.bool_]:
+    def observable(self) -> Bools:
         """(22,) which canonical joints this sensor has."""
         return (self.to_canonical != 0).any(axis=1)
 
@@ -158,7 +159,7 @@ def _texts(value: object) -> list[str]:
 
 def to_canonical(
     skeleton: Skeleton, positions: NDArray[np.floating], confidence: NDArray[np.floating] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Map a sensor's J joints (..., J, 3) metres, in any frame and NaN where missing, to the canonical 22.
 
     Returns positions (..., 22, 3), NaN where unobserved, and confidence (..., 22), the least of the sensor joints used,

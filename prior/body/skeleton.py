@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS
+from steadypose.prior.arrays import Bools, Floats
 
 PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 """Parent of each canonical joint; -1 for the root."""
@@ -44,7 +45,7 @@ MIRROR: NDArray[np.intp] = np.array(
 )
 """(22,) index of each joint's counterpart on the other side; a joint of the middle is its own counterpart."""
 
-REST_OFFSETS: NDArray[np.float64] = np.array(
+REST_OFFSETS: Floats = np.array(
     [
         [0.0, 0.0, 0.0],  # pelvis
         [0.0, 0.088, -0.075],  # left_hip
@@ -75,18 +76,18 @@ REST_OFFSETS: NDArray[np.float64] = np.array(
 It is a generic adult of 1.72 m with common anthropometric proportions.
 """
 
-REST_LENGTHS: NDArray[np.float64] = np.linalg.norm(REST_OFFSETS, axis=-1)
+REST_LENGTHS: Floats = np.linalg.norm(REST_OFFSETS, axis=-1)
 """(22,) length of each joint's bone, metres; 0 for the root."""
 
 
-def _rest_positions() -> NDArray[np.float64]:
+def _rest_positions() -> Floats:
     placed = np.zeros((len(PARENTS), 3))
     for joint, parent in enumerate(PARENTS[1:], start=1):
         placed[joint] = placed[parent] + REST_OFFSETS[joint]
     return placed
 
 
-REST_POSITIONS: NDArray[np.float64] = _rest_positions()
+REST_POSITIONS: Floats = _rest_positions()
 """(22, 3) positions relative to the pelvis in the rest pose, metres."""
 
 HIPS = (J["left_hip"], J["right_hip"])
@@ -108,7 +109,7 @@ def limbs(*chains: tuple[str, ...]) -> list[list[int]]:
     return [[J[f"{side}_{part}"] for part in chain] for side in ("left", "right") for chain in chains]
 
 
-def finite_joints(positions: NDArray[np.floating]) -> NDArray[np.bool_]:
+def finite_joints(positions: NDArray[np.floating]) -> Bools:
     """(..., J) which joints of (..., J, 3) have three finite coordinates, so were observed."""
     return np.asarray(np.isfinite(positions).all(axis=-1))
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.compiled import njit
 
@@ -86,9 +86,7 @@ _HIP_SAMPLES, _HIP_SIDE_SAMPLES, _TRUNK_BAND = 2.7, 2.2, 0.25
 or turned trunk's skin, metres."""
 
 
-def lift(
-    keypoints: Floats, confidence: Floats, depth: NDArray[Any], intrinsics: Floats
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def lift(keypoints: Floats, confidence: Floats, depth: NDArray[Any], intrinsics: Floats) -> tuple[Floats32, Floats32]:
     """Lift the key points of the bodies in an image to 3D.
 
     Args:

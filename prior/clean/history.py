@@ -35,12 +35,12 @@ class Ring:
         self._next = (self._next + 1) % self._frames
 
     @property
-    def all(self) -> NDArray[np.float64]:
+    def all(self) -> Floats:
         """(frames, ...) oldest first; a view, for reading only."""
         return self._data[self._next : self._next + self._frames]
 
     @property
-    def newest(self) -> NDArray[np.float64]:
+    def newest(self) -> Floats:
         """The newest frame."""
         return self._data[(self._next - 1) % self._frames]
 
@@ -49,7 +49,7 @@ class Ring:
         at = (self._next - 1 - back) % self._frames
         self._data[at, slot] = self._data[at + self._frames, slot] = values
 
-    def clear(self, slot: NDArray[np.bool_]) -> None:
+    def clear(self, slot: Bools) -> None:
         """Reset these slots (the first axis of a frame) to the initial value, in all frames."""
         self._data[:, slot] = self._fill
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import CHILDREN, PARENT, limbs
@@ -170,7 +169,7 @@ def _attribute(bad):
 
 
 @njit(cache=True)
-def frozen_joints(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+def frozen_joints(positions: Floats) -> Bools:
     """(B, 22) joints of a sensor's output (B, T, 22, 3) that the tracker lost and for which it repeats its last output;
     NaN where it has none, and the last frames count.
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from steadypose.prior.arrays import Bools, Floats
@@ -58,12 +57,12 @@ class Gap(NamedTuple):
     end: int
 
 
-def frames_apart(known: NDArray[np.bool_]) -> Floats:
+def frames_apart(known: Bools) -> Floats:
     """(T, K) frames to the nearest frame in which each column is ``known`` (T, K); infinite if there is none."""
     return np.minimum(*frames_since_and_until(known))
 
 
-def frames_since_and_until(known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def frames_since_and_until(known: Bools) -> tuple[Floats, Floats]:
     """(T, K) frames since the last and until the next frame in which each column is ``known``; infinite if none."""
     at = np.arange(len(known), dtype=np.float64)[:, None]
     before = np.maximum.accumulate(np.where(known, at, -np.inf), axis=0)

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import Event, EventKind, Hand, Phase, PoseWorld, Tracking, WorldBody
+from steadypose.prior.arrays import Floats
 from steadypose.prior.events.features import Arm, Features, facing_away, features
 from steadypose.prior.events.trigger import RandomWalk, Trigger, Wave
 from steadypose.prior.settings import check_range
@@ -93,7 +93,7 @@ _ANGLES = frozenset(
 """Settings in radians."""
 
 
-NOWHERE: NDArray[np.float64] = np.zeros(3)
+NOWHERE: Floats = np.zeros(3)
 NOWHERE.flags.writeable = False
 SPEED_NS = 100_000_000
 """Interval over which speeds are measured, nanoseconds; a centimetre of jitter then counts as 0.1 m/s."""
@@ -111,9 +111,7 @@ class EventDetector:
         self._bodies: dict[int, _Body] = {}
         self._stamp_ns = -1
 
-    def update(
-        self, world: PoseWorld, sensor: NDArray[np.float64] = NOWHERE, *, calibrated: bool = False
-    ) -> list[Event]:
+    def update(self, world: PoseWorld, sensor: Floats = NOWHERE, *, calibrated: bool = False) -> list[Event]:
         """Return all events that begin, continue or end with the next message of the stream.
 
         Args:
@@ -170,7 +168,7 @@ class _Body:
         self._wrists: deque[tuple[int, tuple[list[float], ...]]] = deque()
         self._arms: tuple[Arm, ...] = ()
 
-    def update(self, stamp_ns: int, body: WorldBody, sensor: NDArray[np.float64], floor: float) -> Iterator[Event]:
+    def update(self, stamp_ns: int, body: WorldBody, sensor: Floats, floor: float) -> Iterator[Event]:
         """Yield the events that begin, continue or end at ``stamp_ns``."""
         self.stamp_ns = stamp_ns
         seen = features(body, sensor, floor)

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.msgs.types import CONTACTS, JointState, WorldBody
+from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
 
 Point = list[float]
@@ -74,7 +74,7 @@ class Arm(NamedTuple):
     """Whether, in addition, the forearm points up."""
     wrist: Point
     """(3,) metres, world."""
-    direction: NDArray[np.float64]
+    direction: Floats
     """(3,) unit vector, world, from the head through the wrist: the most accurate line of pointing (Nickel and
     Stiefelhagen 2007)."""
 
@@ -105,7 +105,7 @@ class Features(NamedTuple):
     """Left and right arm."""
 
 
-def features(body: WorldBody, sensor: NDArray[np.float64], floor: float = math.nan) -> Features:
+def features(body: WorldBody, sensor: Floats, floor: float = math.nan) -> Features:
     """Compute the features of one body, relative to a sensor at (3,) metres, world.
 
     ``floor`` is the height of a known floor, metres, world; NaN if there is none.
@@ -175,7 +175,7 @@ def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
     return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
 
 
-def _from_height(p: NDArray[np.float32], height: float, sigma: float) -> tuple[Quantity, Quantity]:
+def _from_height(p: Floats32, height: float, sigma: float) -> tuple[Quantity, Quantity]:
     """Extension of unobserved legs and angle of their thighs, from the height of the hips above a standing ankle and
     its standard deviation, metres. Between `SEATED` and `UPRIGHT`, they are interpolated. A bone without an estimate is
     as long as the other side's, or an adult's."""

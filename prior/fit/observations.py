@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from steadypose.prior.arrays import Floats
 from steadypose.prior.body.capsules import CAPSULES, REST_HEIGHT, stature
 from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.energy import Term, bisquare, geman_mcclure, huber
@@ -185,7 +184,7 @@ class SurfacePoints:
         return found
 
 
-def thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def thinned(points: Floats) -> Floats:
     """Thin points (T, N, 3) evenly to about `MOST_POINTS` per frame; neighbours with correlated errors add little."""
     return points[:, :: max(points.shape[1] // MOST_POINTS, 1)]
 

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import rotation_matrices
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.complete.parts import PartsCompleter
@@ -161,7 +161,7 @@ class Optimiser:
             schedule.step()
         return best
 
-    def _meeting_known(self, columns: Floats, given: Floats, known: NDArray[np.bool_]) -> Floats:
+    def _meeting_known(self, columns: Floats, given: Floats, known: Bools) -> Floats:
         """Return rotations (T, 22, 3, 3) from ``columns`` (T, 22, 6), corrected over time to meet the known ones."""
         line = draw_line(known[None])
         wanted = given[..., :2].swapaxes(-1, -2).reshape(columns.shape)
@@ -170,7 +170,7 @@ class Optimiser:
         return rotations_of_6d(columns + (off - anchored(off, line, everything))[0])
 
 
-def _mask(known: NDArray[np.bool_]) -> Tensor:
+def _mask(known: Bools) -> Tensor:
     return torch.from_numpy(known[..., None].astype(np.float32))
 
 

@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.kinematics import CONTACT_JOINTS
 from steadypose.prior.fit.energy import Anchored
 from steadypose.prior.fit.humor_network import HumorNet
@@ -64,7 +63,7 @@ class FittedTrack:
     """(K, T, 22) `Observed.misfit` of each of K observations"""
     energies: Floats
     """(W, S) nats after each stage"""
-    kept: NDArray[np.bool_]
+    kept: Bools
     """(W,) whether a window's last stage was kept"""
 
 

@@ -43,7 +43,7 @@ def contact_features(
     sigma: NDArray[np.floating],
     root_seen: Floats,
     ground: Floats,
-) -> NDArray[np.float32]:
+) -> Floats32:
     """Build the features (B, `FEATURES`) of B frames.
 
     Args:
@@ -103,7 +103,7 @@ class LiveContacts:
         """Load the weights of this name; raises like `load_weights`."""
         return cls(load_weights(weights, "contacts")[0])
 
-    def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> Contacts:
+    def __call__(self, features: Floats32, state: Floats32) -> Contacts:
         """Process one frame: features (B, `FEATURES`) and hidden states (B, `hidden`)."""
         outputs, state = self._net(features, state)
         predicted = sigmoid(outputs)

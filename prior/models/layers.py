@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats32
 from steadypose.prior.models.matmul import multiply_packed, packed
@@ -53,7 +52,7 @@ class LiveRecurrent:
         self._head = Dense(weights["head.weight"], weights["head.bias"])
         self.hidden = weights["head.weight"].shape[1]
 
-    def __call__(self, features: NDArray[np.float32], state: NDArray[np.float32]) -> tuple[Floats32, Floats32]:
+    def __call__(self, features: Floats32, state: Floats32) -> tuple[Floats32, Floats32]:
         """Return the head's outputs (B, O) for one frame's features (B, F), and the next hidden state (B, `hidden`)."""
         reset_in, update_in, new_in = np.split(self._input(features), 3, axis=-1)
         reset_kept, update_kept, new_kept = np.split(self._kept(state), 3, axis=-1)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.skeleton import BONES_BETWEEN, MIRROR, PARENT, REST_POSITIONS, J, limbs
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, load_weights
@@ -86,7 +86,7 @@ def new_past(slots: int) -> Past:
     return past
 
 
-def forget(past: Past, slot: NDArray[np.bool_]) -> None:
+def forget(past: Past, slot: Bools) -> None:
     """Reset these slots (S,)."""
     past.poses[slot] = past.place[slot] = np.nan
     past.speed[slot] = past.speed_seen[slot] = 0.0
@@ -292,7 +292,7 @@ class Occluded(NamedTuple):
     """(N,) index of the joint"""
     candidates: Floats
     """(N, 4, 3) metres, in the order of `CANDIDATES`"""
-    features: NDArray[np.float32]
+    features: Floats32
     """(N, `FEATURES`) float32"""
 
 

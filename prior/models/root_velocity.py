@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.kinematics import yaw_matrix
@@ -59,7 +58,7 @@ class NewestMotion(NamedTuple):
     """(B, hidden) hidden state for the next frame"""
 
 
-def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> NDArray[np.float32]:
+def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> Floats32:
     """Build the features (B, `FEATURES`) of B frames, turned by their heading (B,) so that each body faces +x.
 
     ``joints`` and ``before``, those in the frame ``dt`` seconds before, are (B, 22, 3) metres relative to the root, z
@@ -88,7 +87,7 @@ class LiveRootVelocity:
         """(count, hidden) hidden states of bodies before their first frame."""
         return np.zeros((count, self._net.hidden), dtype=np.float32)
 
-    def __call__(self, features: NDArray[np.float32], state: Floats32) -> NewestMotion:
+    def __call__(self, features: Floats32, state: Floats32) -> NewestMotion:
         """Process one frame: `velocity_features` (B, `FEATURES`) and hidden states (B, hidden)."""
         outputs, state = self._net(features, state)
         return NewestMotion(outputs[:, :3], outputs[:, 3:6], state)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, finite_joints
@@ -81,7 +80,7 @@ def features(history: Floats, camera: Floats) -> Floats:
     return np.concatenate([turned.reshape(len(hips), -1), distance, -view[:, 2:], seen], axis=1)
 
 
-def recall(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+def recall(frames: Floats) -> Floats:
     """(H, B, 22, 3) frames of the ages `HISTORY` among ``frames`` (T, B, 22, 3), which are oldest first.
 
     Frames before a body's first one repeat its first.

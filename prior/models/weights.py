@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from steadypose import PACKAGE
+from steadypose.prior.arrays import Floats32
 from steadypose.prior.settings import MODEL
 
-Arrays: TypeAlias = Mapping[str, NDArray[np.float32]]
+Arrays: TypeAlias = Mapping[str, Floats32]
 """A network's weights by their names in its state dict, such as ``blocks.0.first.weight``."""
 
 WEIGHTS = PACKAGE / "prior" / "weights"

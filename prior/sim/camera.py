@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from steadypose.msgs.types import Pose, PoseRaw, RawBody
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.capsules import CAPSULES, REST_HEIGHT, Mount, mount, stature
 from steadypose.prior.body.skeleton import COLLARS, JOINTS, TRUNK, J
 from steadypose.prior.sim.motion import Motion
@@ -93,7 +93,7 @@ class Camera:
             lost[k] |= lost[k - 1] and rng.random() < 0.4
         return (nominal + jitter)[~lost]
 
-    def in_view(self, points: Floats) -> NDArray[np.bool_]:
+    def in_view(self, points: Floats) -> Bools:
         """Which points (..., 3), optical frame, lie in the image and beyond `near`."""
         x, y, z = np.moveaxis(points, -1, 0)
         half = np.tan(np.array(self.field_of_view) / 2)
@@ -196,7 +196,7 @@ def film(
 class _Track:
     positions: Floats  # (T, J, 3) metres, optical frame, NaN where lost
     confidence: Floats  # (T, J)
-    reported: NDArray[np.bool_]  # (T,)
+    reported: Bools  # (T,)
 
 
 def _track(
@@ -261,7 +261,7 @@ def _swap_rate_factor(person: Motion, eye: Floats) -> Floats:
     return 1.0 + 9.0 * np.clip(1.0 - facing, 0.0, 1.0) ** 2
 
 
-def _exchanged(truth: Floats, on_body: Mount, when: dict[str, NDArray[np.bool_]]) -> Floats:
+def _exchanged(truth: Floats, on_body: Mount, when: dict[str, Bools]) -> Floats:
     points = truth.copy()
     for group, active in when.items():
         columns = np.flatnonzero(np.isin(on_body.joint, SWAP_GROUPS[group]))
@@ -269,7 +269,7 @@ def _exchanged(truth: Floats, on_body: Mount, when: dict[str, NDArray[np.bool_]]
     return points
 
 
-def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> Bools:
     """(T, J) random bursts with the rate ``rate`` (T, J) 1/s and the mean duration `_BLEED_DURATION`."""
     begin = rng.random(rate.shape) < 1 - np.exp(-rate * dt[:, None])
     end = rng.random(rate.shape) < 1 - np.exp(-dt[:, None] / _BLEED_DURATION)
@@ -279,14 +279,14 @@ def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> NDArray[np.bo
     return on
 
 
-def _found(visible: NDArray[np.bool_], times: Floats) -> NDArray[np.bool_]:
+def _found(visible: Bools, times: Floats) -> Bools:
     """When a body is reported: once it has been visible for a while, until it is not."""
     appears = visible & ~np.concatenate([[True], visible[:-1]])  # what is visible at the start was so before
     began = np.maximum.accumulate(np.where(appears, times, times[0] - 1.0))
     return visible & (times - began >= _FIND_AFTER)
 
 
-def _ids(reported: Sequence[NDArray[np.bool_]], times: Floats) -> list[NDArray[np.int64]]:
+def _ids(reported: Sequence[Bools], times: Floats) -> list[NDArray[np.int64]]:
     """(T,) track ids of each body, counted up as bodies appear; a new id after a long absence."""
     ids = [np.zeros(len(times), dtype=np.int64) for _ in reported]
     current, last_seen, next_id = [0] * len(reported), [-np.inf] * len(reported), 1

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.body.skeleton import J
@@ -194,9 +194,9 @@ class FootTrack:
     """(T,) radians, direction of the foot"""
     pitch: Floats
     """(T,) radians, positive with the toe down"""
-    heel_planted: NDArray[np.bool_]
+    heel_planted: Bools
     """(T,) whether the ankle stays in place"""
-    toe_planted: NDArray[np.bool_]
+    toe_planted: Bools
     """(T,) whether the ball of the foot stays in place"""
 
     @property

@@ -8,11 +8,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.capsules import TOE_HEIGHT
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, forward_kinematics, heading, yaw_matrix
 from steadypose.prior.body.skeleton import JOINTS, J
@@ -36,7 +35,7 @@ class Motion:
     """(T, 3) metres, position of the pelvis in the world"""
     rotations: Floats
     """(T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world"""
-    contacts: NDArray[np.bool_]
+    contacts: Bools
     """(T, 8) which of `CONTACT_JOINTS` rest on the floor"""
 
     @cached_property

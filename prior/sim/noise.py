@@ -24,9 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import J
 
 KINECT_NOISE = Path(__file__).with_name("kinect_noise.json")
@@ -239,12 +238,12 @@ def travelled(positions: Floats) -> Floats:
     return np.concatenate([step[..., :1, :], step], axis=-2) if step.shape[-2] else np.zeros(positions.shape[:-1])
 
 
-def swapped(dt: Floats, rng: np.random.Generator, rate_factor: Floats | float) -> dict[str, NDArray[np.bool_]]:
+def swapped(dt: Floats, rng: np.random.Generator, rate_factor: Floats | float) -> dict[str, Bools]:
     """Return when left and right are exchanged, (T,) for each of `SWAP_GROUPS`.
 
     ``rate_factor`` (T,) multiplies `SWAP_RATE`, for a body seen from its side.
     """
-    result: dict[str, NDArray[np.bool_]] = {}
+    result: dict[str, Bools] = {}
     for group in SWAP_GROUPS:
         rate = np.broadcast_to(SWAP_RATE[group] * np.asarray(rate_factor), dt.shape)
         active = np.empty(dt.shape, dtype=bool)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.recording import RecordingWriter
 from steadypose.msgs.topics import POSE_RAW, POSE_TRUTH
 from steadypose.msgs.types import JointState, PoseRaw, PoseWorld, Tracking, WorldBody
+from steadypose.prior.arrays import Bools
 from steadypose.prior.body.capsules import mount
 from steadypose.prior.sim.camera import Camera, as_tracked, film, sight
 from steadypose.prior.sim.motion import Motion
@@ -170,7 +170,7 @@ def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) ->
     return messages
 
 
-def _seen(person: Motion, people: list[Motion], camera: Camera) -> NDArray[np.bool_]:
+def _seen(person: Motion, people: list[Motion], camera: Camera) -> Bools:
     """(T, 22) whether each joint is in view and not hidden."""
     eye = np.array(camera.position)
     hidden = as_tracked(sight(person.positions, people, eye).hidden, mount("smpl22"))

@@ -12,9 +12,8 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.timing.rate import FPS
 
 PERIOD_NS = round(1e9 / FPS)
@@ -92,7 +91,7 @@ class Resampler:
         self._positions = np.full((2, self._slots, 22, 3), np.nan)
         self._confidence = np.zeros((2, self._slots, 22))
 
-    def clear(self, slot: NDArray[np.bool_]) -> None:
+    def clear(self, slot: Bools) -> None:
         """Forget the observations of these slots (S,)."""
         self._seen_ns[:, slot] = np.iinfo(np.int64).min // 2
         self._decimation.clear(slot)
@@ -156,11 +155,11 @@ class Republished:
     """Distinguishes frames that a stream repeats regularly from a body at rest without noise."""
 
     def __init__(self) -> None:
-        self._newest: NDArray[np.float64] | None = None
+        self._newest: Floats | None = None
         self._run = 0
         self._runs: deque[int] = deque([0] * RUNS, maxlen=RUNS)
 
-    def update(self, positions: NDArray[np.float64]) -> bool:
+    def update(self, positions: Floats) -> bool:
         """Whether a frame repeats the last one. ``positions`` are (S, 22, 3), NaN where unobserved."""
         if self._newest is not None and np.array_equal(positions, self._newest, equal_nan=True):
             self._run += 1
@@ -195,7 +194,7 @@ class DecimationFilter:
         self._squares = np.zeros((2, slots, 22))
         self._counted = np.zeros((slots, 22))
 
-    def clear(self, slot: NDArray[np.bool_]) -> None:
+    def clear(self, slot: Bools) -> None:
         """Forget the joints of these slots (S,)."""
         for frame in self._frames:
             frame.positions[slot] = np.nan

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import limbs
@@ -16,7 +15,7 @@ from steadypose.prior.world.kalman import BodyFilter, BodyNoise
 from steadypose.prior.world.networks import RootVelocity, Stance
 from steadypose.prior.world.observe import FEET, SOLE, BodyObservation
 
-Sigma = TypeVar("Sigma", float, NDArray[np.float64])
+Sigma = TypeVar("Sigma", float, Floats)
 
 EASE_S = 0.1
 """Time constant with which a body returns to its observations when its root is observed again, seconds."""

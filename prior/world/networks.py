@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
+from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, yaw_matrix
 from steadypose.prior.body.skeleton import REST_POSITIONS
 from steadypose.prior.models.contacts import Contacts, LiveContacts, contact_features
@@ -47,7 +46,7 @@ class RootVelocity(NamedTuple):
 class MotionMemory:
     """State of the velocity network for one body: its hidden state (hidden,), and its last joints."""
 
-    state: NDArray[np.float32]
+    state: Floats32
     local: Floats | None = None
 
     def update(self, observed: BodyObservation) -> tuple[Floats, Floats, float]:
@@ -122,7 +121,7 @@ def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> S
 class ContactMemory:
     """State of the contact network for one body: its hidden state (hidden,), and its last observation."""
 
-    state: NDArray[np.float32]
+    state: Floats32
     observed: BodyObservation | None = None
 
 

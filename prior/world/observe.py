@@ -56,7 +56,7 @@ class BodyObservation:
     """(22, 3) metres; NaN where unknown"""
     orientation: Floats
     """(4,) xyzw, orientation of the root; the last valid one if the message has none"""
-    observed: NDArray[np.bool_]
+    observed: Bools
     """(22,) whether each joint was observed and not inferred"""
     sigma: Floats
     """(22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none"""
@@ -97,7 +97,7 @@ class BodyObservation:
         return self.sigma[_FEET]
 
     @property
-    def feet_observed(self) -> NDArray[np.bool_]:
+    def feet_observed(self) -> Bools:
         """(4,) whether each of `FEET` was observed."""
         return self.observed[_FEET]
 
@@ -142,7 +142,7 @@ def observe(
     return observations
 
 
-def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _orientations(quaternions: Floats, sensor: Floats) -> tuple[Floats, Bools]:
     """Turn quaternions (N, 4) of any norm from the sensor's frame to the world; also returns which are rotations."""
     with np.errstate(invalid="ignore"):
         valid = np.linalg.norm(quaternions, axis=1) >= _MIN_NORM

@@ -9,8 +9,8 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.matmul import multiply_packed, packed
 from steadypose.prior.models.mixture.bank import (
@@ -42,8 +42,6 @@ from steadypose.prior.models.weights import load_weights
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
-Floats = NDArray[np.float32]
-
 
 class MixtureSmoother:
     """Fixed-lag smoother of the joints of several bodies: `MixtureNet` over a `Bank`.
@@ -72,9 +70,7 @@ class MixtureSmoother:
         self._stamps: list[float] = []
         self._count = 0
 
-    def update(
-        self, positions: NDArray[np.float64], stamp_s: float, confidence: NDArray[np.float64] | None = None
-    ) -> Smoothed | None:
+    def update(self, positions: Floats, stamp_s: float, confidence: Floats | None = None) -> Smoothed | None:
         """Process a frame (S, 22, 3) metres, world-aligned with z up, NaN where unobserved, of an increasing stamp in
         seconds, and return the estimate of the frame ``delay`` earlier, or None if there is none yet. ``confidence``
         (S, 22) is 1 if omitted.
@@ -104,7 +100,7 @@ class MixtureSmoother:
         self._stamps, self._count = [], 0
         return held
 
-    def forget(self, slot: NDArray[np.bool_]) -> None:
+    def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,), including the estimates that the delay still holds."""
         forget(self._bank, slot)
         self._whiteness.forget(slot)
@@ -135,49 +131,49 @@ class MixtureSmoother:
 class _Network(NamedTuple):
     """A trained `MixtureNet`: float32 weights, `packed`, and biases (rows, out). Biases of the same sum are merged."""
 
-    mean: Floats
-    per_deviation: Floats
-    read: Floats
-    joint: Floats
-    own_decay: Floats
-    gather: Floats
-    gather_bias: Floats
-    body_decay: Floats
-    remember: Floats
-    remember_bias: Floats
-    think: Floats
-    think_bias: Floats
-    tell: Floats
-    tell_bias: Floats
-    mix: Floats
-    joint_mix: Floats
-    deepen: Floats
-    deepen_bias: Floats
-    write: Floats
-    write_bias: Floats
+    mean: Floats32
+    per_deviation: Floats32
+    read: Floats32
+    joint: Floats32
+    own_decay: Floats32
+    gather: Floats32
+    gather_bias: Floats32
+    body_decay: Floats32
+    remember: Floats32
+    remember_bias: Floats32
+    think: Floats32
+    think_bias: Floats32
+    tell: Floats32
+    tell_bias: Floats32
+    mix: Floats32
+    joint_mix: Floats32
+    deepen: Floats32
+    deepen_bias: Floats32
+    write: Floats32
+    write_bias: Floats32
 
 
 class _Memory(NamedTuple):
     """Recurrent state of S bodies: sums of `Memory` and their weights, and the last outputs."""
 
-    own: Floats  # (S, 22, own)
-    own_weight: Floats
-    body: Floats  # (S, body)
-    body_weight: Floats
-    written: Floats  # (S, 22, OUTPUTS)
+    own: Floats32  # (S, 22, own)
+    own_weight: Floats32
+    body: Floats32  # (S, body)
+    body_weight: Floats32
+    written: Floats32  # (S, 22, OUTPUTS)
 
 
 @cache
 def _network(name: str) -> _Network:
     arrays, _ = load_weights(name, "mixture")
 
-    def weight(layer: str) -> Floats:
+    def weight(layer: str) -> Floats32:
         return packed(arrays[f"{layer}.weight"].T)
 
-    def bias(layer: str, rows: int = 1) -> Floats:
+    def bias(layer: str, rows: int = 1) -> Floats32:
         return np.tile(arrays[f"{layer}.bias"], (rows, 1))
 
-    def decay(layer: str) -> Floats:
+    def decay(layer: str) -> Floats32:
         return (1.0 / (1.0 + np.exp(-arrays[f"{layer}.decay"]))).astype(np.float32)
 
     return _Network(

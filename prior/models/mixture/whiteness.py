@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.body.vectors import apart
 from steadypose.prior.compiled import median, njit
@@ -69,17 +69,17 @@ class Whiteness:
         self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, _BONES))
         self._pairs, self._undone = np.zeros((2, slots, _BONES))
 
-    def forget(self, slot: NDArray[np.bool_]) -> None:
+    def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
         self._last[slot] = self._step[slot] = np.nan
         for moment in (self._frames, self._mean, self._variance, self._change, self._pairs, self._undone):
             moment[slot] = 0.0
 
-    def share(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def share(self, positions: Floats) -> Floats:
         """Process joints (S, 22, 3) metres, NaN where unobserved; returns the white share (S,) of the noise."""
         return np.minimum(SHARE * self.update(positions) ** 2, 1.0)
 
-    def update(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def update(self, positions: Floats) -> Floats:
         """Process joints like `share`; returns the whiteness (S,), from 0 (lasting or unknown noise) to 1."""
         white = np.zeros(len(positions))
         _update(
@@ -123,7 +123,7 @@ def _update(positions, last, step, frames, mean, variance, change, pairs, undone
             white[slot] = median(ratios[:count])
 
 
-def fallback(white: NDArray[np.float64], scale: NDArray[np.float64], delay: int) -> NDArray[np.float64]:
+def fallback(white: Floats, scale: Floats, delay: int) -> Floats:
     """Return the weight (S,) of the multiple-model estimate, by the share of the noise that is white (S,), the
     estimated noise (S,) metres along an axis, and the smoother's look-ahead in frames.
     """
