@@ -23,13 +23,14 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.capsules import CAPSULES
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, quaternions, yaw_matrix
-from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
+from steadypose.prior.body.skeleton import HIPS, JOINTS, REST_OFFSETS, SHOULDERS, J
 from steadypose.prior.camera.key_points import KeyPointRecording
 from steadypose.prior.fit.humor_network import HumorNet
 from steadypose.prior.fit.motion import float_tensor
 from steadypose.prior.fit.observations import KeyPoints, Observed, Pinhole, SeenJoints, SurfacePoints, thinned
 from steadypose.prior.fit.solve import FitSettings, Start
 from steadypose.prior.fit.windows import FittedTrack, Track, fit_track
+from steadypose.prior.models.occlusion import STANDING
 from steadypose.prior.timing.rate import FPS
 
 _BONES = [(J[a], J[b]) for side in ("left", "right") for a, b in (
@@ -74,7 +75,7 @@ def starts_of_key_points(
     focal, centre = camera.focal.numpy().astype(float), camera.centre.numpy().astype(float)
     rotation, position = camera.rotation.numpy().astype(float), camera.position.numpy().astype(float)
     rays = (pixels - centre) / focal
-    rest = _arms_down(offsets)
+    rest = place_joints(solve_rotations(STANDING, offsets), offsets)  # these bones, with the arms down
     depth = _depth(rays, rest)
     if floor_known and (standing := _standing_depth(rays, rotation, position, ground)) is not None:
         size = float(np.median(standing / depth))
@@ -168,17 +169,6 @@ def _toes(rays: Floats) -> Floats | None:
         return None
     smooth = gaussian_filter1d(_interpolated(_nanmean(pointing)), _SMOOTHING_SIGMA, mode="nearest")
     return np.where(smooth < 0.0, -1.0, 1.0)
-
-
-def _arms_down(offsets: Floats) -> Floats:
-    """(22, 3) metres relative to the pelvis, rest pose with these bones and the arms down."""
-    pose = REST_POSITIONS.copy()
-    for side in ("left", "right"):
-        shoulder = pose[J[f"{side}_shoulder"]]
-        for part in ("elbow", "wrist"):
-            joint = J[f"{side}_{part}"]
-            pose[joint] = shoulder - [0.0, 0.0, np.linalg.norm(pose[joint] - shoulder)]
-    return place_joints(solve_rotations(pose, offsets), offsets)
 
 
 def _nanmean(values: Floats) -> Floats:

@@ -7,7 +7,7 @@ well as stage 2 (the discrepancy principle, Morozov 1966).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
@@ -126,13 +126,12 @@ def fit_window(
     *,
     anchor: Anchored | None = None,
     stages: int = 3,
-    advanced: Callable[[], None] = lambda: None,
 ) -> Fitted:
     """Fit a window of a few seconds, at least three frames, from initial poses to terms of observations, with a model
     in evaluation mode.
 
     ``anchor`` has the frames shared with the window before. With 2 ``stages`` it stops before the motion model, which
-    is HuMoR's VPoser-t; ``advanced`` is called after each.
+    is HuMoR's VPoser-t.
     """
     model.requires_grad_(False)
     variables = Variables.initial(start.root, start.rotations, start.offsets, start.ground, model.config.latent)
@@ -145,7 +144,6 @@ def fit_window(
         before = variables
         variables, value = minimise(model, variables, stage.free, stage.terms, stage.steps)
         found.append(value)
-        advanced()
     with torch.no_grad():
         motion, earlier = Motion(model, variables), Motion(model, before)
         kept = "latents" not in chosen[-1].free or _explains(motion, earlier, observed, settings.discrepancy)

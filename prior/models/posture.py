@@ -152,8 +152,8 @@ def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: 
 class RootCovariance:
     """The covariance of a root's orientation, which messages do not carry, of published joints and deviations."""
 
-    def __init__(self, weights: str = "default") -> None:
-        self._posture = LivePosture.load(weights)
+    def __init__(self) -> None:
+        self._posture = LivePosture.load("default")
 
     def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
         """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame, of joints (B, 22,

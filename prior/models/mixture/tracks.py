@@ -40,13 +40,13 @@ INITIAL_SPEED = 1.0
 
 
 @cache
-def body_covariance(name: str = "default") -> Floats:
+def body_covariance() -> Floats:
     """(22, 22) covariance of joints' accelerations along an axis, relative to their mean variance; read-only.
 
     Six of its eigenvectors explain five sixths of it. It is equal for x, y and z, so that it does not depend on the
     body's heading. It is learned from training motion (`training.recipes.moments`).
     """
-    covariance = load_weights(name, "body_modes")[0]["covariance"].astype(np.float64)
+    covariance = load_weights("default", "body_modes")[0]["covariance"].astype(np.float64)
     covariance.flags.writeable = False
     return covariance
 

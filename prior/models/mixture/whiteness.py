@@ -76,11 +76,8 @@ class Whiteness:
             moment[slot] = 0.0
 
     def share(self, positions: Floats) -> Floats:
-        """Process joints (S, 22, 3) metres, NaN where unobserved; returns the white share (S,) of the noise."""
-        return np.minimum(SHARE * self.update(positions) ** 2, 1.0)
-
-    def update(self, positions: Floats) -> Floats:
-        """Process joints like `share`; returns the whiteness (S,), from 0 (lasting or unknown noise) to 1."""
+        """Process joints (S, 22, 3) metres, NaN where unobserved; returns the white share (S,) of the noise, 0 while it
+        is unknown."""
         white = np.zeros(len(positions))
         _update(
             positions, self._last, self._step, self._frames, self._mean, self._variance, self._change, self._pairs,
@@ -89,7 +86,7 @@ class Whiteness:
         frames = self._frames.max(axis=1)
         lasting = np.minimum(CERTAIN * (1.0 - np.minimum(SHARE * white**2, 1.0)), 1.0)
         self.lasting = lasting * frames / (frames + START_NEWEST)
-        return white * frames / (frames + self._start)
+        return np.minimum(SHARE * (white * frames / (frames + self._start)) ** 2, 1.0)
 
 
 @njit(cache=True)
