@@ -7,9 +7,8 @@ varies with the noise after smoothing, whose variance the smoother gives, and wi
 variance, halved because a bone has two ends, is the bias's variance. If the mean length differs from the person's bone,
 or one segment varies by more than the others, the sensor's definition of a joint differs from the skeleton's. The
 length of that segment is then uncertain. The estimates weigh measured bones against human proportions
-(`prior.body.bone_lengths`) and determine how tightly bones constrain hidden joints. Constraining observed joints to the
-bones as well gained 0.2 % of a Kinect's error and cost 0.6 mm on a noise-free input, so they are left alone here; the
-posture stage counts lengths as one observation among many.
+(`prior.body.bone_lengths`) and determine how tightly bones constrain hidden joints. Observed joints are not constrained
+here; the posture stage counts lengths as one observation among many.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ _EXCHANGED = np.array(np.unravel_index(np.arange(9), (3, 3))) > 0
 
 
 class ExchangedLimbs:
-    """Puts exchanged limbs of ``slots`` bodies back. An exchange that lasts longer than ``patience_s`` is believed,
+    """Puts exchanged limbs of ``slots`` bodies back. An exchange that lasts longer than ``patience_s`` is accepted,
     unless it makes a posture less likely."""
 
     def __init__(self, patience_s: float, slots: int) -> None:

@@ -73,7 +73,7 @@ class Fuse:
         self,
         smoothed: Smoothed,
         person: Person,
-        slow_error: SensorBias,
+        bias: SensorBias,
         rotations: Floats,
         imputed: Imputed | None,
         unseen_s: Floats,
@@ -86,7 +86,7 @@ class Fuse:
         Args:
             smoothed: the joints, smoothed and denoised.
             person: the bodies' bones.
-            slow_error: the sensor's bias, estimated so far.
+            bias: the sensor's, estimated so far.
             rotations: (S, 22, 3, 3) local, for joints that are not observed.
             imputed: (S, 22, 3) and (S, 22), the frame completed by HG-VAE; None if no body is completed.
             unseen_s: (S, 22) seconds since each joint was last observed, at this frame.
@@ -96,10 +96,10 @@ class Fuse:
         """
         s = self._settings
         slots, count = np.flatnonzero(present), len(present)
-        offsets, decoded, bias = person.offsets[slots], rotations[slots], slow_error.bias_sigma[slots]
+        offsets, decoded, bias_sigma = person.offsets[slots], rotations[slots], bias.bias_sigma[slots]
         seen, deviation, unseen = smoothed.positions[slots], smoothed.sigma[slots], unseen_s[slots]
         held_s = _unseen_of_subtree(unseen)
-        precision = Precision(*_weigh(deviation, held_s, bias, s.prior_sigma, s.prior_drift, s.fade))
+        precision = Precision(*_weigh(deviation, held_s, bias_sigma, s.prior_sigma, s.prior_drift, s.fade))
         known = held_s <= s.fade
         body, fitted = place_joints(decoded, offsets), decoded
         well = _align(body, seen, precision)
@@ -123,7 +123,7 @@ class Fuse:
             # if no joint of a frame was observed, the smoother is more accurate than the prior
             here = (unseen <= unseen.min(axis=1, keepdims=True)) & np.isfinite(deviation)
             variance = _merge(body, seen, here, precision)
-            length_variance = slow_error.length_variance[slots] + _of_rigid(person.length_variance[slots])
+            length_variance = bias.length_variance[slots] + _of_rigid(person.length_variance[slots])
             # Joints between two observations close in time do not move either. Constraining a joint to its bones for a
             # frame or two would make it flicker.
             stays = here | (seen_later[slots] & (unseen < BRIEF_S))

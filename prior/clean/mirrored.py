@@ -5,7 +5,7 @@ a limb's depth relative to its root, for seconds. Most mirrored limbs are possib
 But the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back.
 The end is found by the same test. If the root is off along the ray too, the whole body jumped. Near the image plane
 neither is seen, so no limb is mirrored back for long. Neither is seen in a limb that was hidden, because nobody knows
-where it went: such a limb is believed.
+where it went: such a limb is accepted.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MEMORY, FIRST = 20, 10
 """Length of the running mean square of that distance, and number of frames before a limb is judged."""
 
 IN_A_ROW = 3
-"""Number of frames for which a joint must have been observed before its prediction is believed, and for which a limb
+"""Number of frames for which a joint must have been observed before its prediction is used, and for which a limb
 must be hidden before its fault is over."""
 
 LONGEST, REMEMBERED = 30, 300

@@ -66,7 +66,7 @@ class Posture:
         expected = self._posture(positions[slots], np.sqrt(variance), lengths[slots])
         share = SHARE * variance / (variance + LITTLE**2)
         positions[slots] += share[..., None] * (expected.positions - positions[slots])
-        # joints of a sensor whose errors last share many of them, so the others tell less than the Gaussian believes
+        # joints of a sensor whose errors last share many of them, so the others tell less than the Gaussian assumes
         surer = (1.0 - sure) * share * np.minimum(expected.sigma - sigma[slots], 0.0)
         sigma[slots] += np.where(observed, surer, 0.0)  # errors of a hidden joint are less like the Gaussian's
         return replace(estimate, positions=positions, sigma=sigma)

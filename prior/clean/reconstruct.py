@@ -2,9 +2,8 @@
 result.
 
 HG-VAE is trained to denoise windows and models nonlinear motion; the whole-body smoothers model only the linear part.
-After these smoothers, in noise of 4 cm with a delay of four frames, it reduces the error by 1 % on dancers and by 8 %
-on people who exercise (validation, measured with earlier weights). In noise of 1 cm it has almost no weight. Both
-estimates share most of their noise, so the fusion weights account for correlated errors.
+In noise of 1 cm it has almost no weight. Both estimates share most of their noise, so the fusion weights account for
+correlated errors.
 """
 
 from __future__ import annotations

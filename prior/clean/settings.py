@@ -86,7 +86,7 @@ class DenoiseSettings:
 
 @dataclass(frozen=True)
 class PersonSettings:
-    """Settings of the bones stage."""
+    """Settings of the person stage."""
 
     enabled: bool = True
     """whether to measure bones; if off, every body has a generic adult's bones"""

@@ -117,7 +117,7 @@ def features(body: WorldBody, sensor: Floats, floor: float = math.nan) -> Featur
     hips = _middle(p[J["left_hip"]], p[J["right_hip"]])
     ankle = min(ANKLES, key=lambda joint: _last_if_nan(p[joint][2]))
     leg = 0.5 * sum(
-        _distance(p[J[f"{side}_{upper}"]], p[J[f"{side}_{lower}"]])
+        math.dist(p[J[f"{side}_{upper}"]], p[J[f"{side}_{lower}"]])
         for side in ("left", "right")
         for upper, lower in (("hip", "knee"), ("knee", "ankle"))
     )
@@ -171,7 +171,7 @@ def _away(body: WorldBody, to_sensor: Sequence[float]) -> Quantity:
 
 def _thigh(p: list[Point], s: list[float], side: str) -> Quantity:
     hip, knee = J[f"{side}_hip"], J[f"{side}_knee"]
-    length = _distance(p[hip], p[knee])
+    length = math.dist(p[hip], p[knee])
     return Quantity(_angle_to_up(p[knee], p[hip]), math.hypot(s[hip], s[knee]) / max(length, 0.1))
 
 
@@ -206,8 +206,8 @@ def _rotated(quaternion: list[float], v: Point) -> Point:
 def _arm(p: list[Point], s: list[float], observed: list[bool], left: tuple[float, float], side: str) -> Arm:
     shoulder, elbow, wrist = (J[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist"))
     neck, head = J["neck"], J["head"]
-    upper, lower = _distance(p[shoulder], p[elbow]), _distance(p[elbow], p[wrist])
-    whole = _distance(p[shoulder], p[wrist])
+    upper, lower = math.dist(p[shoulder], p[elbow]), math.dist(p[elbow], p[wrist])
+    whole = math.dist(p[shoulder], p[wrist])
     cosine = (upper**2 + lower**2 - whole**2) / max(2.0 * upper * lower, 1e-6)
     inner = math.nan if math.isnan(cosine) else math.acos(max(-1.0, min(1.0, cosine)))
     from_up = _angle_to_up(p[shoulder], p[wrist])
@@ -229,10 +229,6 @@ def _arm(p: list[Point], s: list[float], observed: list[bool], left: tuple[float
 
 def _middle(a: Point, b: Point) -> Point:
     return [0.5 * (a[k] + b[k]) for k in range(3)]
-
-
-def _distance(a: Point, b: Point) -> float:
-    return math.dist(a, b)
 
 
 def _angle_to_up(start: Point, end: Point) -> float:

@@ -77,8 +77,7 @@ def states_of(root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
 def facing(orientation: Tensor) -> Tensor:
     """Return rotations (..., 3, 3) about z to the headings of bodies with these orientations (..., 3, 3).
 
-    The result equals that of `training.data.dataset.heading` by atan2, without computing an angle. The official code's
-    acos has no derivative where the body faces along the axis.
+    The result equals that of `prior.fit.tensors.heading`, without computing an angle, and has a derivative everywhere.
     """
     x, y = orientation[..., 0, 1], orientation[..., 1, 1]
     length = (x.square() + y.square()).clamp(min=_MIN_LEVEL**2).sqrt()

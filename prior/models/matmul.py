@@ -65,7 +65,7 @@ def _tile(rows: int, vectors: int) -> Any:
         column: Any,
         start: Any,
         below: Any,
-        beside: Any,
+        near: Any,
     ) -> Any:
         """Write the tile of ``shift + a @ weight`` that begins at ``row`` and ``column``.
 

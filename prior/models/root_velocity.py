@@ -1,7 +1,6 @@
 """Live prediction of a body's root velocity from its own motion (HM-VAE, section 3.3), without torch.
 
-A recurrent network replaces the paper's convolutions over the skeleton, which saw 25 frames. It is smaller and takes
-less than half the time. Its drift is smaller on validation people and equal on test people (benchmarks/NOTEBOOK.md).
+A recurrent network replaces the paper's convolutions over the skeleton, which see 25 frames; it is smaller and faster.
 """
 
 from __future__ import annotations
