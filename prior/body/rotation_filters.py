@@ -66,12 +66,11 @@ MAX_SIGMA = 0.5
 """Standard deviation of an unknown joint, metres."""
 _LEAST_LENGTH = 0.03  # least length of a bone, metres
 
+UNKNOWN_TWIST: Floats = np.tile([0.0, TWIST_RANGE**2], (LIMBS, 1))
+"""(4, 2) angle and variance of each limb's twist before the first observation."""
 
-def unknown_twist(slots: int) -> Floats:
-    """(S, 4, 2) angle and variance of each limb's twist before the first observation."""
-    state = np.zeros((slots, LIMBS, 2))
-    state[..., 1] = TWIST_RANGE**2
-    return state
+UNKNOWN_TURNS: Floats = np.tile([0.0, 0.0, 0.0, BODIES**2], (len(_SHORT), 1))
+"""(4, 4) usual rotation vector of each short bone and its variance about an axis, before any observation."""
 
 
 @njit(cache=True)
@@ -82,7 +81,7 @@ def follow_twist(orientations, offsets, sigma, state):
         orientations: (B, 22, 3, 3) of all joints in one frame of reference, from `solve_rotations`.
         offsets: (B, 22, 3) metres, the bones.
         sigma: (B, 22) metres along an axis, standard deviations of the joints used for the solution.
-        state: (B, 4, 2) from `unknown_twist`, updated.
+        state: (B, 4, 2) of each body, `UNKNOWN_TWIST` at first, updated.
     """
     turn, twist, swing = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     of_end, of_last = np.empty((3, 3)), np.empty((3, 3))
@@ -127,17 +126,10 @@ def follow_twist(orientations, offsets, sigma, state):
                 write_product(world[end], of_last, world[last])
 
 
-def unknown_turns(bodies: int) -> Floats:
-    """(B, 4, 4) usual rotation vector of each short bone and its variance about an axis, before any observation."""
-    turns = np.zeros((bodies, len(_SHORT), 4))
-    turns[..., 3] = BODIES**2
-    return turns
-
-
 def follow_short_bones(orientations: Floats, offsets: Floats, sigma: Floats, turns: Floats) -> None:
     """Turn short bones towards their usual directions for one frame, in place. Other bones do not change.
 
-    ``turns`` (B, 4, 4) from `unknown_turns` is updated; the other arguments are those of `follow_twist`.
+    ``turns`` (B, 4, 4), `UNKNOWN_TURNS` at first, is updated; the other arguments are those of `follow_twist`.
     """
     above = orientations[:, PARENT[_SHORT]]
     shown = to_rotation_vectors(above.swapaxes(-1, -2) @ orientations[:, _SHORT])

@@ -193,5 +193,4 @@ class CleanCore:
         if self._orient:
             oriented = self._orient.update(replace(mixed, sigma=estimate.sigma))
             mixed = replace(mixed, rotations=oriented.rotations)
-        estimate = mixed
-        return CleanFrame(estimate, newest.score, self._history.observed[at], self._history.confidence[at])
+        return CleanFrame(mixed, newest.score, self._history.observed[at], self._history.confidence[at])

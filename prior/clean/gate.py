@@ -61,12 +61,8 @@ class Gate:
         self._exchanged.forget(slot)
         self._mirrored.forget(slot)
         self._observed.clear(slot)
-        self._jitter[slot] = 0.0
-        self._mean_distance[slot] = 0.0
-        self._frames[slot] = 0
-        self._lost[slot] = 0
-        self._refused[slot] = 0
-        self._bad_frames[slot] = 0
+        for values in (self._jitter, self._mean_distance, self._frames, self._lost, self._refused, self._bad_frames):
+            values[slot] = 0
 
     def update(self, observation: Observation) -> Gated:
         """Return the newest frame without rejected joints."""

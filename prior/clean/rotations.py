@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from steadypose.prior.arrays import Bools, Floats, Floats32
 from steadypose.prior.body.inverse_kinematics import solve_rotations
 from steadypose.prior.body.kinematics import global_rotations, heading, yaw_matrix
-from steadypose.prior.body.rotation_filters import follow_short_bones, follow_twist, unknown_turns, unknown_twist
+from steadypose.prior.body.rotation_filters import UNKNOWN_TURNS, UNKNOWN_TWIST, follow_short_bones, follow_twist
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
@@ -82,11 +82,11 @@ class Orient:
 
     def __init__(self, settings: OrientSettings, slots: int) -> None:
         self._posture = LivePosture.load(settings.weights)
-        self._twist, self._turns = unknown_twist(slots), unknown_turns(slots)
+        self._twist, self._turns = (np.tile(of_body, (slots, 1, 1)) for of_body in (UNKNOWN_TWIST, UNKNOWN_TURNS))
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        self._twist[slot], self._turns[slot] = unknown_twist(1), unknown_turns(1)
+        self._twist[slot], self._turns[slot] = UNKNOWN_TWIST, UNKNOWN_TURNS
 
     def update(self, estimate: Estimate) -> Estimate:
         """Return the estimate with rotations solved from the whole body. Call it with frames in order."""

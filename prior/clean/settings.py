@@ -174,25 +174,19 @@ class OrientSettings:
 
 @dataclass(frozen=True)
 class PriorSettings:
-    """Settings of the prior: ``[prior]`` of a launch file.
-
-    Attributes:
-        delay: look-ahead in frames at 30 Hz, from a frame to its output, 0 to 16. The default of 4 is half of HM-VAE's
-            window, which gives the paper's centre-frame refinement.
-        max_bodies: largest number of bodies tracked at once.
-        timeout: seconds without an observation after which a body is dropped, and seconds without a frame after which
-            the stream starts anew.
-        bias_sigma: metres along an axis, expected standard deviation of the sensor's bias. It is the prior of the bias
-            that is estimated from the stream, and a fault must exceed it. Depth cameras have 2 cm or more.
-        identify: settings of the identify stage, which assigns body ids instead of the source (off by default).
-        gate, correct, smooth, reconstruct, denoise, person, score, impute, refine, fuse, posture, steady, orient:
-            settings of the stages.
-    """
+    """Settings of the prior: ``[prior]`` of a launch file. Each stage has its own."""
 
     delay: int = 4
+    """frames at 30 Hz, look-ahead from a frame to its output, 0 to 16. The default is half of HM-VAE's window, which
+    gives the paper's centre-frame refinement"""
     max_bodies: int = 8
+    """largest number of bodies tracked at once"""
     timeout: float = 0.5
+    """seconds without an observation after which a body is dropped, and seconds without a frame after which the stream
+    starts anew"""
     bias_sigma: float = 0.02
+    """metres along an axis, expected standard deviation of the sensor's bias. It is the prior of the bias that is
+    estimated from the stream, and a fault must exceed it. Depth cameras have 2 cm or more"""
     identify: IdentifySettings = field(default_factory=IdentifySettings)
     gate: GateSettings = field(default_factory=GateSettings)
     correct: CorrectSettings = field(default_factory=CorrectSettings)

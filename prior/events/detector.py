@@ -217,13 +217,8 @@ class _Body:
         stands = take(EventKind.STANDS, none, extension, extension_sigma, possible=not lies and not sits)
         fastest = self._fastest_fall(now, seen.neck)
         fallen = self._triggers[EventKind.FELL, none].active
-        take(
-            EventKind.FELL,
-            none,
-            s.fell_speed + 1.0 if fallen else fastest,
-            CERTAIN,
-            (lies or fallen) and not (stands or sits),
-        )
+        down = (lies or fallen) and not (stands or sits)
+        take(EventKind.FELL, none, s.fell_speed + 1.0 if fallen else fastest, CERTAIN, possible=down)
         take(EventKind.NEAR, none, -seen.distance.value, seen.distance.sigma)
         turned = facing_away(*self._facing.update(now, seen.across, seen.across_sigma), seen.to_sensor)
         take(EventKind.FACES_SENSOR, none, -turned.value, turned.sigma, possible=not lies)

@@ -204,8 +204,6 @@ class Rollout:
 
     states: State
     """(..., T) states, without the initial one"""
-    latents: Tensor
-    """(..., T, latent) latents of the steps"""
     contacts: Tensor
     """(..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none"""
 
@@ -226,16 +224,14 @@ def _rolled(
     model: HumorNet, state: State, offsets: Tensor, steps: list[Tensor] | list[torch.Generator | None]
 ) -> Rollout:
     states: list[State] = []
-    latents: list[Tensor] = []
     contacts: list[Tensor] = []
     for step in steps:
         latent = step if isinstance(step, Tensor) else _drawn(model, state, step)
         state, logits = model.step(state, latent, offsets)
         states.append(state)
-        latents.append(latent)
         contacts.append(logits)
     dim = state.root.dim() - 1
-    return Rollout(stack(states, dim), torch.stack(latents, dim), torch.stack(contacts, dim))
+    return Rollout(stack(states, dim), torch.stack(contacts, dim))
 
 
 def _drawn(model: HumorNet, state: State, generator: torch.Generator | None) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -32,11 +31,6 @@ class CorrectionConfig:
     """width of its two hidden layers"""
     sensor: str = "kinect_v2"
     """name of the sensor that it corrects"""
-
-    @classmethod
-    def from_dict(cls, config: dict[str, Any]) -> CorrectionConfig:
-        """Build the configuration from the JSON of a weights file."""
-        return cls(**config)
 
 
 def trunk_frame(positions: Floats) -> Floats:

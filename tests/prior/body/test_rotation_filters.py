@@ -6,7 +6,7 @@ from tests.helpers.bodies import fk
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
 from steadypose.prior.body.kinematics import global_rotations
-from steadypose.prior.body.rotation_filters import follow_short_bones, follow_twist, unknown_turns, unknown_twist
+from steadypose.prior.body.rotation_filters import UNKNOWN_TURNS, UNKNOWN_TWIST, follow_short_bones, follow_twist
 from steadypose.prior.body.skeleton import PARENT, REST_OFFSETS, REST_POSITIONS, J
 
 OFFSETS = REST_OFFSETS[None]
@@ -34,7 +34,7 @@ def _local(orientations: np.ndarray) -> np.ndarray:
 def test_a_bent_arm_shows_its_twist_at_once() -> None:
     turned = _arm(0.5, 1.2)
     as_solved = turned.copy()
-    follow_twist(turned, OFFSETS, EXACT, unknown_twist(1))
+    follow_twist(turned, OFFSETS, EXACT, UNKNOWN_TWIST[None].copy())
     np.testing.assert_allclose(turned, as_solved, atol=2e-3)
 
 
@@ -42,7 +42,7 @@ def test_joints_stay_where_they_are_and_hands_and_toes_go_along() -> None:
     vectors, ends = np.random.default_rng(0).normal(0.0, 0.3, (22, 3)), [*HANDS, *FEET]
     local = Rotation.from_rotvec(vectors).as_matrix()[None]
     turned = global_rotations(local)
-    follow_twist(turned, OFFSETS, np.full((1, 22), 0.1), unknown_twist(1))
+    follow_twist(turned, OFFSETS, np.full((1, 22), 0.1), UNKNOWN_TWIST[None].copy())
     found = _local(turned)
     assert Rotation.from_matrix(local[0, SHOULDER].T @ found[0, SHOULDER]).magnitude() > 0.01
     np.testing.assert_allclose(place_joints(found, OFFSETS), place_joints(local, OFFSETS), atol=1e-12)
@@ -51,7 +51,7 @@ def test_joints_stay_where_they_are_and_hands_and_toes_go_along() -> None:
 
 
 def test_a_twist_lasts_through_a_straight_arm_without_a_jump() -> None:
-    state, found = unknown_twist(1), []
+    state, found = UNKNOWN_TWIST[None].copy(), []
     for bend in (*np.linspace(1.0, 0.0, 10), *np.linspace(0.0, 1.0, 10)):
         turned = _arm(0.5, bend)
         follow_twist(turned, OFFSETS, EXACT, state)
@@ -62,7 +62,7 @@ def test_a_twist_lasts_through_a_straight_arm_without_a_jump() -> None:
 
 
 def test_of_noise_a_straight_arm_shows_no_twist() -> None:
-    rng, state, turns = np.random.default_rng(0), unknown_twist(1), []
+    rng, state, turns = np.random.default_rng(0), UNKNOWN_TWIST[None].copy(), []
     for _ in range(50):
         positions = REST_POSITIONS + rng.normal(0.0, 0.01, (1, 22, 3))
         turned = global_rotations(solve_rotations(positions, OFFSETS))
@@ -73,7 +73,7 @@ def test_of_noise_a_straight_arm_shows_no_twist() -> None:
 
 def _followed(turned: np.ndarray, sigma: float) -> np.ndarray:
     """Orientations (T, 22, 3, 3), one after the other."""
-    state, answers = unknown_turns(1), turned.copy()
+    state, answers = UNKNOWN_TURNS[None].copy(), turned.copy()
     for frame in answers:
         follow_short_bones(frame[None], OFFSETS, np.full((1, 22), sigma), state)
     return answers
