@@ -73,10 +73,6 @@ class Level:
     neighbours: list[list[int]]
     groups: list[list[int]]
 
-    @property
-    def edges(self) -> int:
-        return len(self.neighbours)
-
 
 def pooling_levels(parents: Sequence[int]) -> list[Level]:
     """Return the levels of an encoder of four blocks. When no chain is left to merge, pooling is the identity.
