@@ -27,14 +27,6 @@ class IdentifySettings:
     death: float = 5.0
     """seconds without an observation after which a person is forgotten. On return, the person gets a new id"""
 
-    def __post_init__(self) -> None:
-        # a shorter `death` would drop tracks that can still be matched by position
-        for name, least in (("birth", 0.0), ("death", RECENT_S)):
-            if not least <= getattr(self, name) < 60.0:
-                raise ValueError(
-                    f"[prior.identify] {name}: expected {least:g} to 60 seconds, got {getattr(self, name)}"
-                )
-
 
 @dataclass(frozen=True)
 class GateSettings:
@@ -207,6 +199,9 @@ class PriorSettings:
         check_range("[prior] max_bodies", self.max_bodies, 1, 256)  # benchmarks run 256 bodies together
         check_range("[prior] timeout", self.timeout, 0.05, 60.0)
         check_range("[prior] bias_sigma", self.bias_sigma, 0.0, 1.0)
+        check_range("[prior.identify] birth", self.identify.birth, 0.0, 60.0)
+        # a shorter `death` would drop tracks that can still be matched by position
+        check_range("[prior.identify] death", self.identify.death, RECENT_S, 60.0)
         check_range("[prior.gate] min_confidence", self.gate.min_confidence, 0.0, 1.0)
         check_range("[prior.person] samples", self.person.samples, 1, 1e6)
         check_range("[prior.person] every", self.person.every, 1, 1e6)

@@ -31,7 +31,7 @@ completion have ten times the acceleration of real ones."""
 
 
 class PartsCompleter:
-    """Completes windows, with the interface of `LiveCompleter`, and with weights of HG-VAE.
+    """Completes windows, with the interface of `LiveCompleter` and its mean pose ``usual``, and with weights of HG-VAE.
 
     Raises:
         FileNotFoundError: there are no such weights.
@@ -43,14 +43,9 @@ class PartsCompleter:
         sizes = HGVAEConfig.from_dict(config)
         if sizes.completion is None:
             raise WeightsError("weights 'default' of hgvae: expected some with a completion network, these have none")
-        self._completer, self._frames = completer, sizes.frames
+        self._completer, self._frames, self.usual = completer, sizes.frames, completer.usual
         self._completion = LiveCompletion(sizes.completion, part(arrays, "completion"), 1)
         self._mean = arrays["mean"].astype(np.float64)[:, None]
-
-    @property
-    def usual(self) -> Floats:
-        """(22, 4) local quaternions, xyzw, of the mean pose."""
-        return self._completer.usual
 
     def __call__(self, positions: Floats, offsets: Floats) -> tuple[Floats, Floats]:
         """Return local rotations (B, T, 22, 3, 3) and root positions (B, T, 3), metres, like `LiveCompleter`."""

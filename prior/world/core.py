@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from steadypose.prior.arrays import Bools
+from steadypose.prior.arrays import Bools, Floats32
 from steadypose.prior.models.contacts import Contacts
 from steadypose.prior.world.feet import Feet, FeetState
 from steadypose.prior.world.filter import RootFilter, RootState
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
 from steadypose.prior.world.networks import (
-    ContactMemory,
     ContactNetwork,
     MotionMemory,
     RootVelocity,
@@ -50,9 +49,10 @@ class BodyEstimate:
 class BodyStages:
     """State of all stages for one body. Each body gets a new one, so that no state of another body can remain."""
 
-    observed: BodyObservation
+    observed: BodyObservation  # the newest
+    before: BodyObservation  # the one before it, for a new body the same
     motion: MotionMemory
-    contacts: ContactMemory
+    contacts: Floats32  # (hidden,) hidden state of the contact network
     filter: RootFilter
     legs: LegMemory = field(default_factory=LegMemory)
     feet: Feet = field(default_factory=Feet)
@@ -99,9 +99,11 @@ class WorldCore:
         velocities: Sequence[RootVelocity | None] = [None] * len(bodies)
         if self._predicts:
             velocities = self._velocity.update([body.motion for body in bodies], observed)
-        all_contacts = self._contacts.update([body.contacts for body in bodies], observed, scene.floor)
+        states, before = [body.contacts for body in bodies], [body.before for body in bodies]
+        all_contacts = self._contacts.update(states, before, observed, scene.floor)
         estimates = []
         for body, now, velocity, contacts in zip(bodies, observed, velocities, all_contacts, strict=True):
+            body.contacts = contacts.state
             guessed = body.legs.update(now)
             holding = stance(contacts, now, body.filter.feet_off) if self._anchors else _NO_STANCE
             scene.floor.update(now, holding.rest, guessed[FEET_OF_LEGS])
@@ -115,7 +117,7 @@ class WorldCore:
         body = scene.bodies.get(observed.body.id)
         if body is None:
             motion, contacts = self._velocity.memory(), self._contacts.memory()
-            body = BodyStages(observed, motion, contacts, RootFilter(observed, self._noise))
+            body = BodyStages(observed, observed, motion, contacts, RootFilter(observed, self._noise))
             scene.bodies[observed.body.id] = body
-        body.observed = observed
+        body.before, body.observed = body.observed, observed
         return body

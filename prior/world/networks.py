@@ -117,36 +117,31 @@ def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> S
     return Stance(*(holds * p[_FOOT_CONTACTS].astype(np.float64) for p in (contacts.load, contacts.rest)))
 
 
-@dataclass
-class ContactMemory:
-    """State of the contact network for one body: its hidden state (hidden,), and its last observation."""
-
-    state: Floats32
-    observed: BodyObservation | None = None
-
-
 class ContactNetwork:
     """Predicts the contacts of all bodies of a message at once."""
 
     def __init__(self, weights: str) -> None:
         self._net = LiveContacts.load(weights)
 
-    def memory(self) -> ContactMemory:
-        """Return the state of a new body."""
-        return ContactMemory(np.zeros(self._net.hidden, dtype=np.float32))
+    def memory(self) -> Floats32:
+        """Return the hidden state (hidden,) of a new body."""
+        return np.zeros(self._net.hidden, dtype=np.float32)
 
     def update(
-        self, memories: Sequence[ContactMemory], observed: Sequence[BodyObservation], floor: Floor
+        self,
+        states: Sequence[Floats32],
+        before: Sequence[BodyObservation],
+        observed: Sequence[BodyObservation],
+        floor: Floor,
     ) -> list[Contacts]:
-        """Predict each body's load (8,), rest (8,) and new hidden state (hidden,), and update the ``memories``."""
+        """Predict each body's load (8,), rest (8,) and new hidden state (hidden,), from its hidden state and its
+        observation of ``before``. After a gap, motion starts anew.
+        """
         if not observed:
             return []
-        before, states, dt = [], [], []
-        for memory, now in zip(memories, observed, strict=True):
-            anew = memory.observed is None or now.after_gap
-            before.append(now if anew else memory.observed)
-            states.append(np.zeros_like(memory.state) if anew else memory.state)
-            dt.append(FRAME_S if anew else now.dt)
+        states = [np.zeros_like(s) if now.after_gap else s for s, now in zip(states, observed, strict=True)]
+        before = [now if now.after_gap else last for last, now in zip(before, observed, strict=True)]
+        dt = [FRAME_S if now.after_gap else now.dt for now in observed]
         roots = [now.root_observed and last.root_observed for now, last in zip(observed, before, strict=True)]
         features = contact_features(
             np.array([now.positions for now in observed]), np.array([last.positions for last in before]),
@@ -154,10 +149,7 @@ class ContactNetwork:
             root_seen=np.array(roots, dtype=float),
             ground=np.array([_under(now, floor, known) for now, known in zip(observed, roots, strict=True)]),
         )  # fmt: skip
-        contacts = [Contacts(*rows) for rows in zip(*self._net(features, np.array(states)), strict=True)]
-        for memory, now, after in zip(memories, observed, contacts, strict=True):
-            memory.observed, memory.state = now, after.state
-        return contacts
+        return [Contacts(*rows) for rows in zip(*self._net(features, np.array(states)), strict=True)]
 
 
 def _under(observed: BodyObservation, floor: Floor, known: bool) -> Floats:

@@ -335,7 +335,7 @@ def test_end_of_stream_flushes_and_is_passed_on() -> None:
         ({"delay": 17}, "delay: expected 0 to 16"),  # longer than the mixture has learned
         ({"timeout": True}, "expected float"),
         ({"score": {"false_alarms": 0.0}}, "false_alarms"),
-        ({"identify": {"birth": -1.0}}, "birth: expected 0 to 60 seconds"),
+        ({"identify": {"birth": -1.0}}, "birth: expected 0 to 60"),
         ({"identify": {"death": float("nan")}}, "death: expected"),
         ({"identify": {"death": 0.0}}, "death: expected"),  # with which nobody would ever get an id
     ],

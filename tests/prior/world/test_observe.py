@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -182,7 +183,7 @@ def test_contacts_are_read_from_two_frames_above_the_ground_under_each_foot(monk
 
     monkeypatch.setattr(LiveContacts, "load", lambda weights: Net())
     network = ContactNetwork("any")
-    memory, floor = network.memory(), Floor(calibrated=True)
+    state, floor = network.memory(), Floor(calibrated=True)
     for _ in range(30):
         floor.observe(np.array([*STANDING[FEET[0], :2], 0.15]), 0.02, 1 / 30)
     positions = STANDING.copy()
@@ -191,8 +192,8 @@ def test_contacts_are_read_from_two_frames_above_the_ground_under_each_foot(monk
     second = seen(first, 0.1, positions=positions + [0.05, 0.0, 0.0])
     gone = seen(second, 1.0, positions=positions)
     hidden = replace(seen(gone, 0.1, positions=positions), root_sigma=np.inf)
-    for now in (first, second, gone, hidden):
-        network.update([memory], [now], floor)
+    for before, now in itertools.pairwise((first, first, second, gone, hidden)):
+        state = network.update([state], [before], [now], floor)[0].state
     joints = np.array(read)[:, 0, :-2].reshape(4, 8, 12)
     known = np.array(read)[:, 0, -2:]
     np.testing.assert_array_equal(known, [[1, 1], [1, 1], [1, 1], [0, 0]])
@@ -202,8 +203,8 @@ def test_contacts_are_read_from_two_frames_above_the_ground_under_each_foot(monk
     raised = np.where(np.isin(joint, FEET), STANDING[joint, 2], positions[joint, 2])
     expected = np.clip(raised - REST_HEIGHT, -0.6, 0.6)
     np.testing.assert_allclose(0.1 * joints[:3, :, 6], np.tile(expected, (3, 1)), atol=1e-3)
-    assert memory.state.tolist() == [2.0], "begun anew after a gap"
-    assert network.update([], [], floor) == []
+    assert state.tolist() == [2.0], "begun anew after a gap"
+    assert network.update([], [], [], floor) == []
 
 
 DT = 1 / 30
