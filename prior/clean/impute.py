@@ -1,8 +1,7 @@
 """The impute stage: the completion network and HG-VAE estimate hidden joints in one pass.
 
 The paper instead maximises log p(z | x) over the missing entries by gradient ascent. Its error grows with every step
-(`steadypose evaluate hgvae`), because the posterior is narrowest for windows that are easy to encode, not for correct
-ones. Ascent in the latents does not gain either (benchmarks/NOTEBOOK.md).
+(`steadypose evaluate hgvae`), because the posterior is narrowest for windows that are easy to encode.
 """
 
 from __future__ import annotations

@@ -51,9 +51,8 @@ _OF_ARMS = np.isin(np.arange(22), np.ravel(_ARMS))
 
 POSTURE_SHARE = 0.5
 """Share of the Gaussian of postures in the position of a joint of an arm that was never observed; half of the rest is
-the averaged completion's, half a standing adult's. Validation: an arm 240 mm standing, 133 completed, 122 by the
-Gaussian, 130 by all three, of which no source of people has more than 1.04 of what it had without the Gaussian (166).
-For legs, whose bones are unknown too, the Gaussian brings nothing (188 and 187)."""
+the averaged completion's, half a standing adult's (validation: 130 mm, 166 without the Gaussian). For legs, whose bones
+are unknown too, the Gaussian brings nothing."""
 
 DENSITIES = np.array([0.05, 0.3, 1.8, 10.0, 60.0])
 """Spectral densities of the acceleration noise of the filters that bridge a gap, m²/s³."""
