@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Bools, Floats, Floats32
+from steadypose.prior.arrays import Floats
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.compiled_graph import Network, Program
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, FaultNetConfig
@@ -55,7 +55,7 @@ def fault_features(
     observed: NDArray[np.floating],
     sensor_sigma: NDArray[np.floating] | float,
     mean: NDArray[np.floating],
-) -> Floats32:
+) -> NDArray[np.float32]:
     """Build the input of `FaultNet`.
 
     Args:
@@ -164,7 +164,7 @@ def pace(mean: Floats) -> Floats:
     return high - (high - low) * (1.0 - share)
 
 
-def joint_odds(odds: Floats, observed: Floats, frozen: Bools) -> Floats:
+def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
     """Adjust the fault network's log odds (B, 22) for frozen joints (B, 22), whose last position the sensor repeats;
     -inf for joints that are not observed (B, 66, T) in the scored frames.
     """

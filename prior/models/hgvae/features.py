@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import HIPS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, TRUNK, J
 from steadypose.prior.compiled import njit
 
@@ -30,22 +29,22 @@ _PATH_COEFFICIENTS = 8
 class Tracks(NamedTuple):
     """Windows, each in its body's frame."""
 
-    x: Floats
+    x: NDArray[np.float64]
     """(..., 66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never observed"""
-    observed: Floats
+    observed: NDArray[np.float64]
     """(..., 66, T) 1 where observed, else 0"""
-    path: Floats
+    path: NDArray[np.float64]
     """(..., T, 3) metres, world, origin of all joints except the pelvis, whose origin is the path's mean"""
-    yaw: Floats
+    yaw: NDArray[np.float64]
     """(...) radians, mean heading of the window"""
 
 
-def body_size(offsets: NDArray[np.floating]) -> Floats:
+def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
     """(...) total length of legs and spine with bones (..., 22, 3), relative to the generic adult's."""
     return np.sqrt((offsets[..., _TALL, :] ** 2).sum(axis=-1)).sum(axis=-1) / _STANDARD
 
 
-def to_tracks(positions: Floats, size: NDArray[np.floating] | float) -> Tracks:
+def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
     """Convert windows (..., T, 22, 3) metres, z up, NaN where missing, of bodies of these sizes (...) (`body_size`) to
     tracks.
     """
@@ -59,7 +58,7 @@ def to_tracks(positions: Floats, size: NDArray[np.floating] | float) -> Tracks:
     return Tracks(*(part.reshape((*batch, *part.shape[1:])) for part in (x, observed, path, yaw)))
 
 
-def in_frame_of(tracks: Tracks, positions: Floats, size: float) -> Floats:
+def in_frame_of(tracks: Tracks, positions: NDArray[np.float64], size: float) -> NDArray[np.float64]:
     """Convert other positions (T, 22, 3), such as ground truth, to tracks (66, T) in the frame of ``tracks``."""
     local = positions - tracks.path[:, None]
     local[:, 0] = positions[:, 0] - tracks.path.mean(axis=0)
@@ -68,7 +67,7 @@ def in_frame_of(tracks: Tracks, positions: Floats, size: float) -> Floats:
     return local.transpose(1, 2, 0).reshape(66, -1)
 
 
-def from_tracks(x: Floats, tracks: Tracks, size: NDArray[np.floating] | float) -> Floats:
+def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floating] | float) -> NDArray[np.float64]:
     """Convert tracks of the last K frames to joint positions (..., K, 22, 3) metres, world: the inverse of `to_tracks`.
 
     Args:
@@ -91,10 +90,10 @@ def hang_unseen(deviations: NDArray[np.floating]) -> None:
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
 
-_low_passes: dict[int, Floats] = {}
+_low_passes: dict[int, NDArray[np.float64]] = {}
 
 
-def _low_pass(frames: int) -> Floats:
+def _low_pass(frames: int) -> NDArray[np.float64]:
     """(T, T) projection onto the lowest cosines."""
     if frames not in _low_passes:
         k, n = np.arange(_PATH_COEFFICIENTS)[:, None], np.arange(frames)

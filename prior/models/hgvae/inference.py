@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats
 from steadypose.prior.models.compiled_graph import LOG_VAR_RANGE, Network, Program
 from steadypose.prior.models.hgvae.config import JOINT_NODES, SCALE, TRACK_LOG_VAR, HGVAEConfig
 from steadypose.prior.models.hgvae.features import hang_unseen
@@ -17,9 +17,9 @@ from steadypose.prior.models.weights import Arrays, load_weights, part
 class Reconstruction(NamedTuple):
     """The distribution p(x | z) of windows."""
 
-    mean: Floats
+    mean: NDArray[np.float64]
     """(..., 66, T) metres of a body of standard size, tracks"""
-    sigma: Floats
+    sigma: NDArray[np.float64]
     """(..., 66, T) metres, standard deviations"""
 
 
@@ -70,7 +70,9 @@ class LiveHGVAE:
         arrays, config = load_weights(weights, "hgvae")
         return cls(HGVAEConfig.from_dict(config), arrays, max_batch)
 
-    def reconstruct(self, x: Floats, observed: Floats, bias_sigma: Floats) -> Reconstruction:
+    def reconstruct(
+        self, x: NDArray[np.float64], observed: NDArray[np.float64], bias_sigma: NDArray[np.float64]
+    ) -> Reconstruction:
         """Encode and decode windows `Tracks.x` (B, 66, T) metres of a body of standard size, NaN for a joint never
         observed; ``bias_sigma`` (B,) is the sensor's bias, metres along an axis.
         """

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.prior.arrays import Floats32
 from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.compiled_graph import LOG_VAR_RANGE, Network, Program
@@ -61,18 +60,18 @@ _NEVER = -1.0
 class Features(NamedTuple):
     """The network's input. Variances are along an axis, in units of `SCALE`."""
 
-    nodes: Floats32
+    nodes: NDArray[np.float32]
     """(B, T / patch, inputs) float32"""
-    mobility: Floats32
+    mobility: NDArray[np.float32]
     """(B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, minus the part that
     noise explains"""
-    noise: Floats32
+    noise: NDArray[np.float32]
     """(B, 22) float32, variance of an observation: jitter and bias"""
-    gap: Floats32
+    gap: NDArray[np.float32]
     """(B, 22, T) float32, frames to an observation; 1 / (1 / last + 1 / next) between two; 0 where observed, -1 for a
     joint never observed"""
 
-    def line_variance(self) -> Floats32:
+    def line_variance(self) -> NDArray[np.float32]:
         """(B, 22, T) variance of the interpolation of hidden joints.
 
         It grows with the time from an observation and with the joint's mobility, and includes the parent's variance. It
@@ -234,7 +233,7 @@ class LiveCompletion:
 
     def complete(
         self, deviations: NDArray[np.floating], observed: NDArray[np.floating], bias_sigma: NDArray[np.floating]
-    ) -> Floats32:
+    ) -> NDArray[np.float32]:
         """Complete the unobserved entries of windows, in place (see `CompletionNet.complete`).
 
         Args:
