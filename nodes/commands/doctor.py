@@ -90,7 +90,7 @@ def listen(launch_file: str, console: Console) -> int:
     from steadypose.msgs.transport import Subscriber
     from steadypose.msgs.types import Diagnostics, PoseRaw
     from steadypose.nodes.checks.problem import check_wire, error, from_values
-    from steadypose.nodes.checks.stream import StreamChecks
+    from steadypose.nodes.checks.stream import AT_ONCE, StreamChecks
     from steadypose.nodes.graph.clock import POLL_S, Clock
     from steadypose.nodes.graph.launch import Launch
     from steadypose.nodes.graph.topology import POSE_NODES
@@ -98,7 +98,8 @@ def listen(launch_file: str, console: Console) -> int:
 
     clock, launch = Clock(), Launch.read(launch_file)
     transport, keys = launch.transport, launch.transport.curve_keys()
-    check = StreamChecks(launch.settings(PriorSettings), len(launch.server.clients) or 1)
+    streams = len(launch.server.clients) or 1
+    check = StreamChecks(launch.settings(PriorSettings), streams)
     addresses, nodes_at = launch.addresses("pose_input"), [transport.endpoint(name) for name in POSE_NODES]
     reported: dict[str, str] = {}
     frames: list[PoseRaw] = []
@@ -107,17 +108,18 @@ def listen(launch_file: str, console: Console) -> int:
         Subscriber(nodes_at, DIAGNOSTICS, keys=keys, clear_text=transport.clear_text) as nodes,
         console.status(f"listening at {', '.join(addresses)}"),
     ):
-        end_ns = clock.now_ns() + LISTEN_NS
-        while (now_ns := clock.now_ns()) < end_ns:
+        end_ns = clock.monotonic_ns() + LISTEN_NS
+        while clock.monotonic_ns() < end_ns:
             if (received := tracker.receive(POLL_S)) and isinstance(raw := received[1], PoseRaw):
-                check.see(raw, now_ns)
+                check.see(raw, clock.now_ns())
                 frames.append(raw)
             while received := nodes.receive(0):
                 if isinstance(news := received[1], Diagnostics):
                     reported |= {cause: f"{news.node}: {text}" for cause, text in from_values(news.values).items()}
         refused = {tracker.addresses: tracker.refused}
     # a replay's stamps are long past, and so is what a tracker's may be: neither says that they should be of now
-    problems = [*check.problems(clock.now_ns(), live=False), *check_wire(refused)]
+    *_, found = [check.problems(clock.now_ns(), live=False) for _ in range(0, streams, AT_ONCE)]
+    problems = [*found, *check_wire(refused)]
     if not frames and not problems:
         problems.append(
             error(

@@ -249,3 +249,15 @@ def test_each_client_of_a_server_is_examined_by_itself(file: str, folder: Path) 
         frames += [door, dataclasses.replace(door, source="desk", bodies=away)]
     found, text = heard(file, frames)
     assert (found, "'door': " in text, "'desk': " in text) == (0, True, True), text
+
+
+def test_all_clients_of_a_server_are_examined(file: str, folder: Path) -> None:
+    clients = [f"ipc://{folder}/pose_input", *(f"tcp://127.0.0.1:{port}" for port in range(1, 6))]
+    Path(file).write_text(f'nodes = ["prior"]\n[server]\nclients = {clients}\n{Path(file).read_text()}')
+    frames = [
+        dataclasses.replace(raw, source=f"kiosk {k}", skeleton="octopus")
+        for raw in walk(30)
+        for k in range(len(clients))
+    ]
+    _, text = heard(file, frames)
+    assert [f"kiosk {k}.unknown_skeleton" in text for k in range(len(clients))] == [True] * len(clients), text
