@@ -79,6 +79,8 @@ LONGEST = 90
 """Largest number of messages in the window."""
 SILENT_NS = 2_000_000_000
 """Time without a message after which a stream counts as stopped, nanoseconds."""
+SET_NS = 10_000_000_000
+"""Time between two checks, which a node makes every second, from which the wall clock was set, nanoseconds."""
 AT_ONCE = 4
 """Largest number of streams examined in one call, in turn, because a server's frames wait meanwhile."""
 NOBODY = 60
@@ -98,14 +100,14 @@ class StreamCheck:
         self._settings = settings
         self._arrivals: deque[tuple[int, PoseRaw]] = deque(maxlen=LONGEST)
         self.received = self.inhabited = 0
-        self._heard_ns = 0
+        self._heard_ns = self._asked_ns = 0
         self._ended = False
         self._found: list[Problem] = []
         self.examined_ns = -1
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
         """Record a message that arrived at wall time ``at_ns``."""
-        self._ended = raw.end_of_stream
+        self._ended, self._heard_ns = raw.end_of_stream, at_ns
         if not raw.end_of_stream:
             self.received += 1
             self.inhabited += bool(raw.bodies)
@@ -121,7 +123,10 @@ class StreamCheck:
         """
         if not self._arrivals or self._ended:
             return []
-        if live and (silent_ns := now_ns - max(self._arrivals[-1][0], self._heard_ns)) > SILENT_NS:
+        if self._asked_ns and not 0 <= now_ns - self._asked_ns < SET_NS:
+            self._heard_ns = now_ns  # this machine's clock was set: silence counts from now
+        self._asked_ns = now_ns
+        if live and (silent_ns := now_ns - self._heard_ns) > SILENT_NS:
             text = (
                 f"no message for {silent_ns / 1e9:.0f} s, after message {self.received}: the tracker has "
                 "stopped, hangs, or lost its connection; restart it, and the stream continues"

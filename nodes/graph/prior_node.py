@@ -56,7 +56,7 @@ class PriorNode(Node):
         self._checks = StreamChecks(settings, clients or 1)
         # such a replay has no timeline
         self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
-        self._started_ns = self.clock.now_ns()
+        self._started_ns = self.clock.monotonic_ns()
         self._limit = BodyLimit(settings.max_bodies, self.clock)
         self._optional = [stage for stage in ("score", "impute") if getattr(settings, stage).enabled]
 
@@ -90,8 +90,9 @@ class PriorNode(Node):
         found = self._checks.problems(now_ns, live=live)
         own = "pose_input" in self.launch.nodes
         patience_ns = OWN_SOURCE_NS if own else FOREIGN_SOURCE_NS
-        if not self._checks.seen and now_ns - self._started_ns > patience_ns:
-            since_s, addresses = (now_ns - self._started_ns) / 1e9, ", ".join(self.launch.addresses("pose_input"))
+        since_ns = self.clock.monotonic_ns() - self._started_ns
+        if not self._checks.seen and since_ns > patience_ns:
+            since_s, addresses = since_ns / 1e9, ", ".join(self.launch.addresses("pose_input"))
             remedy = "see what pose_input reports" if own else "start the tracker, or let it bind that address"
             return [
                 error(

@@ -45,7 +45,7 @@ class TrajectoryNode(Node):
         self._delay_frames = 0
         self._bodies = 0
         self._seen = False
-        self._started_ns = self.clock.now_ns()
+        self._started_ns = self.clock.monotonic_ns()
 
     def handle(self, topic: str, message: Message) -> None:
         if not isinstance(message, PoseClean):
@@ -69,7 +69,7 @@ class TrajectoryNode(Node):
         return pipeline
 
     def problems(self) -> list[Problem]:
-        since_ns = self.clock.now_ns() - self._started_ns
+        since_ns = self.clock.monotonic_ns() - self._started_ns
         # a prior of this launch reports itself that nothing comes
         if self._seen or "prior" in self.launch.nodes or since_ns < PATIENCE_NS:
             return []

@@ -216,13 +216,13 @@ class Host:
 
     def frames(self) -> Iterator[PoseRaw | None]:
         """Skeletons as they arrive, or None after a while without one. Ends when the camera disconnects."""
-        last_frame_ns, timeout_s = self._clock.now_ns(), STARTUP_TIMEOUT_S
+        last_frame_ns, timeout_s = self._clock.monotonic_ns(), STARTUP_TIMEOUT_S
         while self._pipeline.isRunning():
             try:
                 yield self._skeletons.found.get(timeout=POLL_S)
-                last_frame_ns, timeout_s = self._clock.now_ns(), TIMEOUT_S
+                last_frame_ns, timeout_s = self._clock.monotonic_ns(), TIMEOUT_S
             except queue.Empty:
-                if self._clock.now_ns() - last_frame_ns > timeout_s * 1e9:
+                if self._clock.monotonic_ns() - last_frame_ns > timeout_s * 1e9:
                     return
                 yield None
 

@@ -179,7 +179,7 @@ class TfSource(LiveSource):
             with closing(self._source.frames()) as frames:
                 for frame in frames:
                     if frame:
-                        self._waiting.append((self._clock.now_ns(), frame))
+                        self._waiting.append((self._clock.monotonic_ns(), frame))
                     connection.spin(0.0)
                     yield from self._ready()
                     yield None
@@ -197,7 +197,7 @@ class TfSource(LiveSource):
             try:
                 place, turned = self._buffer.lookup(self._settings.fixed_frame, sensor, frame.stamp_ns)
             except TransformError as trouble:
-                if self._clock.now_ns() - came_ns < self._settings.timeout * 1e9:
+                if self._clock.monotonic_ns() - came_ns < self._settings.timeout * 1e9:
                     return
                 self._trouble = str(trouble)
                 self.refused["without a transform"] += 1

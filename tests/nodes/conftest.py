@@ -31,10 +31,12 @@ class VirtualClock(Clock):
 
     def __init__(self) -> None:
         self.time_ns = 5_000_000_000
+        self.set_ns = 0
+        """by how much the wall clock was set meanwhile"""
         self.slept_ns: list[int] = []
 
     def now_ns(self) -> int:
-        return self.time_ns
+        return self.time_ns + self.set_ns
 
     def monotonic_ns(self) -> int:
         return self.time_ns

@@ -316,8 +316,11 @@ class TestNode:
         assert news.level == Level.ERROR
         assert news.message == news.values["problem.unknown_skeleton"]
 
-    def test_a_tracker_that_stops(self, node: PriorNode, clock: VirtualClock) -> None:
+    @pytest.mark.parametrize("set_s", [0, -7200, 7200])
+    def test_a_tracker_that_stops(self, node: PriorNode, clock: VirtualClock, set_s: int) -> None:
         self.play(node, clock, walk(1.0))
+        clock.set_ns = set_s * SECOND_NS
+        assert "stopped" not in from_values(node.diagnostics().values)
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "restart it" in from_values(node.diagnostics().values)["stopped"]
 
@@ -328,6 +331,7 @@ class TestNode:
         assert node.diagnostics().level == Level.OK
 
     def test_a_tracker_that_never_came(self, node: PriorNode, clock: VirtualClock) -> None:
+        clock.set_ns = -7200 * SECOND_NS
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "pose_input" in from_values(node.diagnostics().values)["no_source"]
 
@@ -340,6 +344,7 @@ class TestNode:
         alone, beside = (
             TrajectoryNode(make_launch(nodes=nodes), clock) for nodes in ('["trajectory"]', '["prior", "trajectory"]')
         )
+        clock.set_ns = 7200 * SECOND_NS
         assert not alone.problems()
         clock.time_ns += round(2.5 * SECOND_NS)
         assert "add 'prior' to nodes" in from_values(alone.diagnostics().values)["no_source"]

@@ -216,6 +216,7 @@ def test_one_that_waits_in_vain_is_dropped_and_told(clock: VirtualClock, monkeyp
     source = TfSource(Given(raw(0, walking(0)), None), settings, clock, lambda _: Robot())  # type: ignore[arg-type]
     frames = source.frames()
     assert next(frames) is None
+    clock.set_ns = -7200 * 10**9
     clock.time_ns += 300_000_000
     assert next(frames) is None
     assert source.refused["without a transform"] == 1
