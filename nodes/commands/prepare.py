@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
@@ -76,6 +77,9 @@ def prepare(
     if rig is not None:
         read = partial(read_own, description=describe(read_toml(rig)))
         sources = [(path, replace(s, read=read) if s.name == "own" else s) for path, s in sources]
+    folder = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):  # told now, not after minutes
+        raise LaunchError(f"--out: cannot write to {out}: expected {folder} to be a folder that can be written to")
     found: list[Prepared | Dropped] = []
     with Progress(console=console) as progress:
         for path, data_set in sources:

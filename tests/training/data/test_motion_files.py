@@ -232,3 +232,6 @@ def test_motion_is_prepared_once_at_each_speed(tmp_path: Path) -> None:
         assert z["name"].tolist() == ["stand.bvh", "stand.bvh x2"]
     with pytest.raises(LaunchError, match="--speeds: expected numbers above 0, got 1, 0"):
         prepare(tmp_path / "takes", tmp_path / "data", (1.0, 0.0))
+    (tmp_path / "takes" / "stand.bvh").write_bytes(b"unreadable")
+    with pytest.raises(LaunchError, match=r"cannot write to .*stand\.bvh to be a folder"):
+        prepare(tmp_path / "takes", tmp_path / "takes" / "stand.bvh" / "data")
