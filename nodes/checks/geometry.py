@@ -15,7 +15,7 @@ from steadypose.prior.arrays import Floats, medians
 from steadypose.prior.body.kinematics import SensorFrame
 from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesses, stance
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.skeleton import J, at_origin
 from steadypose.prior.clean.admission import MAX_DISTANCE
 
 ENOUGH = 15
@@ -36,8 +36,6 @@ RUNNER_M_S, LIMB_M_S = 7.0, 8.0
 and sprinters, the largest medians over 1.5 s are 3.7 and 4.8 m/s."""
 SPEED_BASE_NS = 50_000_000
 """Interval over which speed is measured, nanoseconds. A jitter of 2 cm then amounts to 0.6 m/s."""
-AT_ORIGIN_M = 1e-3
-"""Largest distance from the origin at which a pelvis counts as being there, metres."""
 FLOOR_M = (-0.4, 0.7)
 """Range of the lowest leg joint's height above the floor, metres. A pit or a stage exceeds it."""
 
@@ -286,8 +284,7 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
 def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem]:
     """Problems with bodies that stay at the origin, or whose feet are far from the floor."""
     canonical, _ = to_canonical(skeleton, joints)
-    pelvis = canonical[:, J["pelvis"]]
-    if np.isfinite(pelvis).any() and np.nanmax(np.abs(pelvis)) < AT_ORIGIN_M:
+    if at_origin(canonical):
         yield warning(
             "root_relative",
             "the pelvis is at the origin in every frame, so that nobody moves: the joints seem to be relative to the "

@@ -114,6 +114,14 @@ def finite_joints(positions: NDArray[np.floating]) -> Bools:
     return np.asarray(np.isfinite(positions).all(axis=-1))
 
 
+def at_origin(joints: NDArray[np.floating]) -> bool:
+    """Whether bodies (T, 22, 3) metres, NaN where unknown, stay with their pelvis, or the middle of their hips, at the
+    origin. MediaPipe's hips are up to 1 mm away.
+    """
+    roots = np.stack([joints[:, J["pelvis"]], joints[:, list(HIPS)].mean(axis=1)])
+    return bool((np.fmax.reduce(np.abs(roots), axis=(1, 2), initial=np.nan) < 3e-3).any())
+
+
 _AVATAR_BONES = {
     "pelvis": ("hips", "Hips"), "spine1": ("spine", "Spine"), "spine2": ("chest", "Spine1"),
     "spine3": ("upperChest", "Spine2"), "neck": ("neck", "Neck"), "head": ("head", "Head"),

@@ -19,7 +19,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, SensorFrame, heading, quaternions, yaw_matrix
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
-from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, finite_joints
+from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, at_origin, finite_joints
 from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
 from steadypose.prior.complete.samples import draw
 from steadypose.prior.models.root_velocity import FRAME_S, LiveRootVelocity, velocity_features
@@ -272,13 +272,13 @@ def along_paths(completion: Completion, weights: str) -> list[PoseClean]:
 
 
 def is_root_centred(positions: Floats) -> bool:
-    """Whether joints (T, 22, 3) metres, NaN where unknown, are relative to the pelvis: it stays while others move."""
+    """Whether joints (T, 22, 3) metres, NaN where unknown, are relative to the root: it stays while others move."""
     known = finite_joints(positions)
     if known[:, 0].sum() < FPS // 3:
         return False
     shown = np.where(known[..., None], positions, np.nan)
     spread = np.nan_to_num(np.fmax.reduce(shown) - np.fmin.reduce(shown)).max(axis=-1)
-    return bool(spread[0] < STILL_M and spread[1:].max() > MOVING_M)
+    return bool((spread[0] < STILL_M or at_origin(shown)) and spread[1:].max() > MOVING_M)
 
 
 def root_path(network: LiveRootVelocity, joints: Floats, root_rotations: Floats) -> Floats:

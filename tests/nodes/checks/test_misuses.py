@@ -247,6 +247,12 @@ def test_a_good_stream_has_no_problem(name: str) -> None:
         assert not told([message for _, message in played if isinstance(message, PoseRaw)], live=False)
 
 
+def test_the_origin_between_the_hips_of_a_layout_without_pelvis_is_the_root() -> None:
+    hips = [SKELETONS["blazepose33"].joints.index(f"{side}_hip") for side in ("left", "right")]
+    centred = joints(lambda it: it - it[hips].mean(axis=0))
+    assert set(told([centred(raw, index) for index, raw in enumerate(walk(layout="blazepose33"))])) == {"root_relative"}
+
+
 @pytest.mark.parametrize(("named", "meant"), [("coco17", "h36m17"), ("h36m17", "coco17"), ("kinect22", "smpl22")])
 def test_a_layout_for_another_of_as_many_joints(named: str, meant: str) -> None:
     frames = [dataclasses.replace(raw, skeleton=named) for raw in walk(layout=meant)]

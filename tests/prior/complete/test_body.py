@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import place_joints, solve_rotations
-from steadypose.prior.body.skeleton import REST_OFFSETS, J
+from steadypose.prior.body.skeleton import HIPS, REST_OFFSETS, J
 from steadypose.prior.complete import body, parts
 from steadypose.prior.complete.body import LONGEST, LONGEST_GAP, Uncertainty, complete, frames_apart, gaps, views
 from steadypose.prior.complete.parts import PartsCompleter
@@ -221,6 +221,7 @@ def test_a_way_is_read_from_motion() -> None:
     positions = waving(61)
     centred = positions - positions[:, :1]
     assert is_root_centred(centred)
+    assert is_root_centred(positions - positions[:, list(HIPS)].mean(axis=1, keepdims=True) + 1e-3), "as MediaPipe's"
     assert not is_root_centred(positions)
     assert not is_root_centred(np.repeat(centred[:1], 61, axis=0)), "nothing moves at all"
     facing = np.tile(np.eye(3), (61, 1, 1))
