@@ -288,7 +288,8 @@ def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem
         yield warning(
             "root_relative",
             "the pelvis is at the origin in every frame, so that nobody moves: the joints seem to be relative to the "
-            "root; expected positions relative to the sensor: add the root's place",
+            "root; expected positions relative to the sensor: add the root's place, or have `steadypose complete` "
+            "predict it",
         )
     elif raw.calibrated:
         world = SensorFrame.of(raw.sensor_pose).to_world(canonical)

@@ -92,6 +92,7 @@ def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion
     rate = _rate(stamps_s)
     nearest = min(COMMON_HZ, key=lambda common: abs(common - rate))
     fps = nearest if abs(nearest - rate) <= SAME * nearest else float(np.round(rate, 3))
+    fps = next((video for video in VIDEO_HZ if abs(video - rate) <= ROUNDED * video), fps)
     body = BodyMotion(fps, positions[:, 0], rotations, _bones(positions, rotations))
     placed = body.root + (positions - body.positions).mean(axis=1)
     rate = rate if abs(fps - rate) <= ROUNDED * fps else fps
@@ -105,6 +106,8 @@ def steady(stamps_s: Floats, positions: Floats, rotations: Floats) -> BodyMotion
 COMMON_HZ = (10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 72.0, 90.0, 100.0, 120.0, 144.0, 150.0,
              180.0, 200.0, 240.0, 250.0, 300.0)  # fmt: skip
 """Frame rates of cameras and motion capture, Hz."""
+VIDEO_HZ = (23.976, 29.97, 59.94, 119.88)
+"""Frame rates of video, Hz, which jitter alone does not tell from the common ones."""
 SAME = 0.01
 """Largest deviation from a common rate that counts as rounding or jitter, ratio."""
 ROUNDED = 1e-4

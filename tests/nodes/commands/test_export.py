@@ -180,6 +180,7 @@ def test_a_gap_is_filled_the_rate_kept_and_a_body_placed_by_all_its_joints(tmp_p
     ((np.arange(FRAMES) / 30).round(3), 30.0),
     ((np.arange(FRAMES) / 120).round(3), 120.0),
     (np.arange(FRAMES) / 29.914, 30.0),
+    (np.arange(FRAMES) * 1.001 / 60, 59.94),
     (np.arange(FRAMES) / 30 + np.random.default_rng(0).uniform(0, 0.005, FRAMES), 30.0),
     (np.arange(FRAMES) / 30 + (np.arange(FRAMES) > 9), 30.0),
     (np.arange(FRAMES) / 27.5, 27.5),
