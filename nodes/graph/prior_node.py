@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
@@ -52,6 +52,7 @@ class PriorNode(Node):
             self._pipeline = StreamBatch(settings, clients) if clients else PriorPipeline(settings)
         self._bodies = 0
         self._anomalies = 0
+        self._overrun_before = 0
         self._answers = Answers(self._pipeline.counters, identified=settings.identify.enabled)
         self._checks = StreamChecks(settings, clients or 1)
         # such a replay has no timeline
@@ -101,16 +102,20 @@ class PriorNode(Node):
                 )
             ]
         in_general = self._answers.problems()
-        return [*(found or in_general), *self._overload()]
+        late, self._overrun_before = self.inbox.overrun > self._overrun_before, self.inbox.overrun
+        if late and (slow := [problem for problem in found if problem.cause.endswith("slow")]):
+            # it is this node that skips frames, not the source
+            found = [problem for problem in found if problem not in slow]
+            found.append(self._overload("few of the frames: only the newest are processed"))
+        if (bodies := self._limit.bodies) < (offered := self._pipeline.offered):
+            too_much = f"{bodies} of {offered} bodies: those farthest from the sensor are left out"
+            return [*(found or in_general), self._overload(too_much)]
+        return found or in_general
 
-    def _overload(self) -> Iterator[Problem]:
-        if self._limit.bodies < self._pipeline.offered:
-            stages = " and ".join(f"[prior.{stage}]" for stage in self._optional)
-            yield warning(
-                "overload",
-                f"this machine has time for {self._limit.bodies} of {self._pipeline.offered} bodies: those farthest "
-                f"from the sensor are left out; {f'switch off {stages}, or ' if stages else ''}use a faster machine",
-            )
+    def _overload(self, too_much: str) -> Problem:
+        stages = " and ".join(f"[prior.{stage}]" for stage in self._optional)
+        remedy = f"{f'switch off {stages}, or ' if stages else ''}use a faster machine"
+        return warning("overload", f"this machine has time for {too_much}; {remedy}")
 
     def status(self) -> dict[str, str]:
         counts = {

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -307,6 +308,15 @@ class TestNode:
         settings = {f"prior.{stage}.enabled": "false" for stage in off}
         (problem,) = PriorNode(make_launch(settings, nodes='["prior"]'), clock).problems()
         assert problem.text.endswith(f"left out; {f'switch off {told}, or ' if told else ''}use a faster machine")
+
+    @pytest.mark.parametrize(("overrun", "cause"), [(0, "slow"), (50, "overload")])
+    def test_who_is_slow(self, node: PriorNode, clock: VirtualClock, overrun: int, cause: str) -> None:
+        node.inbox = Mock(overrun=overrun, sources=frozenset(), dropped_of=lambda _: False)
+        node.publish = lambda *_, **__: True  # type: ignore[method-assign]
+        for raw in walk()[::6]:
+            clock.time_ns = raw.stamp_ns
+            node.handle(POSE_RAW, raw)
+        assert list(from_values(node.diagnostics().values)) == [cause]
 
     @pytest.mark.parametrize("rate", [0, 1])
     def test_as_fast_as_possible_stamps_and_clock_part(self, make_launch, clock: VirtualClock, rate: int) -> None:
