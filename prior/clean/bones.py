@@ -30,8 +30,8 @@ from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
 MEMORY = round(3.0 * FPS)
-"""Length of the running moments, frames. It is long compared with an error's correlation time of half a second, and
-short compared with a change of sensor."""
+"""Length of the running moments, and most frames that a mean counts for, frames. It is long compared with an error's
+correlation time of half a second, and short compared with a change of sensor."""
 
 PRIOR_FRAMES = round(0.5 * FPS)
 """Weight of the expected bias as the prior, frames."""
@@ -181,7 +181,7 @@ class BiasEstimator:
         lengths, ends = np.linalg.norm(person.offsets, axis=-1), RIGID[_BONE, 0]
         frames, mean, _, noise = self._moments[:, :, _BONE]
         own = person.length_variance[:, ends] + np.where(person.measured, OWN_LENGTH, GENERIC_LENGTH)[:, None] ** 2
-        rough = noise / np.maximum(frames / CORRELATION_FRAMES, 1.0)
+        rough = noise / np.maximum(np.minimum(frames, MEMORY) / CORRELATION_FRAMES, 1.0)
         share = np.where(frames > 0, own / (own + rough), 0.0)
         lengths[:, ends] += share * (mean - lengths[:, ends])
         return lengths
@@ -224,5 +224,5 @@ def _estimate(positions, sigma, offsets, expected, moments, bias, length_varianc
                 length_variance[s, k] = UNKNOWN_VARIANCE
                 continue
             own = apart(rest, RIGID[k, 0], RIGID[k, 1])
-            square_off = (mean[k] - own) ** 2 - noise[k] / max(frames[k] / CORRELATION_FRAMES, 1.0)
+            square_off = (mean[k] - own) ** 2 - noise[k] / max(min(frames[k], MEMORY) / CORRELATION_FRAMES, 1.0)
             length_variance[s, k] = max(square_off, 0.0) + max(variance[k] - noise[k] - 2.0 * square, 0.0)

@@ -5,7 +5,14 @@ from tests.helpers.bodies import waving
 
 from steadypose.prior.body.inverse_kinematics import RIGID
 from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS
-from steadypose.prior.clean.bones import MIN_FRAMES, UNKNOWN_VARIANCE, BiasEstimator, PersonEstimator, SensorBias
+from steadypose.prior.clean.bones import (
+    MEMORY,
+    MIN_FRAMES,
+    UNKNOWN_VARIANCE,
+    BiasEstimator,
+    PersonEstimator,
+    SensorBias,
+)
 from steadypose.prior.clean.frame import Person
 from steadypose.prior.clean.sensor_error import DepthError
 from steadypose.prior.clean.settings import PersonSettings
@@ -67,6 +74,12 @@ def test_lengths_are_those_observed_as_soon_as_they_are_known() -> None:
     rough = found(1.1 * waving(6), sigma=0.04, jitter=0.04).lengths[0]
     assert (rough[1:] > generic[1:]).all()
     assert (rough[1:] < 1.05 * generic[1:]).all()
+
+
+def test_a_mean_length_is_as_uncertain_after_minutes_as_when_its_memory_is_full() -> None:
+    soon, late = (found(1.1 * waving(n * MEMORY), sigma=0.04, jitter=0.04) for n in (1, 20))
+    np.testing.assert_allclose(late.lengths, soon.lengths, rtol=1e-3)
+    np.testing.assert_allclose(late.length_variance, soon.length_variance, rtol=0.02)
 
 
 BIAS = 0.02
