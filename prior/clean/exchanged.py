@@ -67,6 +67,9 @@ def _orders() -> NDArray[np.intp]:
 _ORDERS = _orders().reshape(9, 22)
 _EXCHANGED = np.array(np.unravel_index(np.arange(9), (3, 3))) > 0
 """(2, 9) whether arms, and legs, are exchanged in each order."""
+_FIRST_ORDERS = np.array([0, 2, 3, 5, 6, 8])
+"""Orders that are tested in a body's first frames, where no jump tells. Not exchanged are legs without their hips: a
+dancer's crossed legs seem to be."""
 
 
 class ExchangedLimbs:
@@ -89,19 +92,19 @@ class ExchangedLimbs:
 
     def begin(self, positions: Floats) -> Bools:
         """Put back, in place, limbs of (S, 22, 3) metres, NaN where unobserved, of bodies in whose first frames another
-        order is likelier. Return the joints (S, 22) that were.
+        order of `_FIRST_ORDERS` is likelier. Return the joints (S, 22) that were.
         """
         back = np.zeros(positions.shape[:2], dtype=bool)
         seen = np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)
         for slot in np.flatnonzero((self._tests > 0) & seen):
             self._tests[slot] -= 1
             misfit = self._posture.misfit(positions[slot, _ORDERS], SIGMA)
-            best = int(misfit.argmin())
+            best = _FIRST_ORDERS[misfit[_FIRST_ORDERS].argmin()]
             if misfit[best] < POSSIBLE and misfit[0] > RATIO * misfit[best] + MARGIN:
                 positions[slot] = positions[slot, _ORDERS[best]]
                 back[slot] = _ORDERS[best] != np.arange(22)
                 self._since[slot], self._misfit[slot], self._frames[slot] = (LASTS + 1) * _EXCHANGED[:, best], misfit, 1
-            if back[slot].any() or misfit[1:].min() > RATIO * misfit[0] + MARGIN:
+            if back[slot].any() or misfit[_FIRST_ORDERS[1:]].min() > RATIO * misfit[0] + MARGIN:
                 self._tests[slot] = 0
         return back
 

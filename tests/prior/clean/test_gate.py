@@ -124,6 +124,15 @@ def test_exchanged_sides_are_put_back_from_the_first_frame_on_and_for_seconds(
     assert np.array_equal(passed, positions, equal_nan=True)
 
 
+def test_crossed_legs_are_not_exchanged_in_the_first_frames() -> None:
+    order = np.arange(22)
+    lower = np.concatenate(limbs(("knee", "ankle", "foot")))
+    order[lower] = MIRROR[lower]
+    crossed = noisy(30, 0.01)[:, order]
+    passed, _ = run(crossed)
+    assert np.array_equal(passed, crossed)
+
+
 def test_sides_are_put_back_while_a_joint_is_hidden() -> None:
     positions = noisy(90, 0.01)
     positions[40:60, WRIST] = np.nan
