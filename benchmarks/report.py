@@ -24,7 +24,7 @@ _LASTING = "measured before noise that lasts was denoised by HG-VAE too, which m
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            "contacts", "hidden_joints", "humor",
+            "hidden_joints", "humor",
             "latency", "restart", "retarget", "rotations",
             "scale", "world",
         ),
