@@ -45,7 +45,7 @@ class _Newest(NamedTuple):
     person: Person
     bias: SensorBias  # estimated up to this frame
     lasting: Floats  # (S,) certainty that the sensor's noise lasts
-    lasting_sigma: Floats  # (S,) metres along an axis, the bias where it may last: none in noise known to be white
+    correlated_sigma: Floats  # (S,) metres along an axis, the bias, none where noise is known to be white
     left_out: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
     rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
@@ -117,8 +117,8 @@ class CleanCore:
         if self._reconstruct:
             windows = self._reconstruct.update(self._history, present, person, bias_sigma)
         if self._denoise:
-            lasting_sigma = (1.0 - self._smooth.white) * bias_sigma
-            smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter, lasting_sigma)
+            correlated_sigma = (1.0 - self._smooth.white) * bias_sigma
+            smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter, correlated_sigma)
         bias = self._bias.update(smoothed, person, gated.jitter)
         left_out = self._depth_error.update(smoothed, self._smooth.white)
         person = self._person.update(smoothed, bias.bias_sigma, present)
@@ -131,9 +131,9 @@ class CleanCore:
         rotations = self._refine.update(gated, person)
         if present.any():
             self._noise = gated.jitter[present], bias.bias_sigma[present]
-        lasting_sigma = (1.0 - self._smooth.white) * bias.bias_sigma
+        correlated_sigma = (1.0 - self._smooth.white) * bias.bias_sigma
         self._newest = newest = _Newest(
-            gated, present, person, bias, self._smooth.lasting, lasting_sigma, left_out, rotations, score, imputed
+            gated, present, person, bias, self._smooth.lasting, correlated_sigma, left_out, rotations, score, imputed
         )
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 
@@ -145,7 +145,7 @@ class CleanCore:
             return []
         held = self._smooth.flush()
         if self._denoise:
-            held = self._denoise.flush(held, self._history, newest.gated.jitter, newest.lasting_sigma)
+            held = self._denoise.flush(held, self._history, newest.gated.jitter, newest.correlated_sigma)
         return [self._fused(smoothed, newest, len(held) - 1 - k) for k, smoothed in enumerate(held)]
 
     def forget(self, slot: Bools) -> None:
@@ -184,7 +184,7 @@ class CleanCore:
             Track(self._history.positions, len(self._history.positions) - 1 - back, newest.gated.jitter),
         )
         if self._posture:
-            noise = np.hypot(newest.gated.jitter, newest.lasting_sigma)
+            noise = np.hypot(newest.gated.jitter, newest.correlated_sigma)
             estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
         if self._steady:
             estimate = self._steady.update(estimate, smoothed.step, self._history.positions[at], newest.lasting)
