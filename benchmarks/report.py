@@ -102,17 +102,17 @@ CHAPTERS = {
         "humor_credit": "What HuMoR brings to a fit",
     },
 }
-"""The page's chapters: results by name, each with its title."""
+"""A page each: results by name, each with its title."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """Write the measured tables into the README and docs/results.md."""
+    """Write the measured tables into the README and the pages of results."""
 
     readme: Path = ROOT / "README.md"
     """File with the markers."""
-    page: Path = ROOT / "docs" / "results.md"
-    """File that is written anew."""
+    pages: Path = ROOT / "docs" / "results"
+    """Folder of pages, which are written anew."""
     results: Path = RESULTS
     """Folder of the JSON files."""
 
@@ -143,20 +143,35 @@ def fill(text: str, results: Mapping[str, Mapping[str, Any]], reasons: Mapping[s
     return _BLOCK.sub(block, text)
 
 
-def page(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> str:
-    """Return an overview, then all tables and pictures by chapter. Raises KeyError if no chapter names a result."""
+def slug(title: str) -> str:
+    """Return a title as a file's name and as an anchor."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+
+
+def pages(results: Mapping[str, Mapping[str, Any]], reasons: Mapping[str, str] = STALE) -> dict[str, str]:
+    """Return the pages by file name: an index with the overview, and all tables and pictures of each chapter.
+
+    Raises:
+        KeyError: No chapter names a result.
+    """
     titles = {name: title for chapter in CHAPTERS.values() for name, title in chapter.items()}
     if unnamed := results.keys() - titles.keys():
         raise KeyError(f"results {', '.join(sorted(unnamed))}: name them in a chapter of benchmarks/report.py")
-    parts = [HOW, overview(results, titles)]
+    written, contents = {}, []
     for chapter, studies in CHAPTERS.items():
-        parts.append(f"\n## {chapter}\n")
-        for name, title in studies.items():
-            if result := results.get(name):
-                parts.append(f"\n### {title}\n")
-                parts += [f"\n{markdown(table, result, reasons.get(name))}" for table in result["tables"]]
-                parts += [f"\n![{stem.replace('_', ' ')}](images/{stem}.png)\n" for stem in result.get("pictures", ())]
-    return "".join(parts)
+        measured = {title: (name, results[name]) for name, title in studies.items() if name in results}
+        if not measured:
+            continue
+        file = f"{slug(chapter)}.md"
+        contents.append(f"| [{chapter}]({file}) | {', '.join(f'[{t}]({file}#{slug(t)})' for t in measured)} |\n")
+        parts = [f"# {chapter}\n\nWhat was measured, and how to read it, is on the [first page](index.md).\n"]
+        for title, (name, result) in measured.items():
+            parts.append(f"\n## {title}\n")
+            parts += [f"\n{markdown(table, result, reasons.get(name))}" for table in result["tables"]]
+            parts += [f"\n![{stem.replace('_', ' ')}](../images/{stem}.png)\n" for stem in result.get("pictures", ())]
+        written[file] = "".join(parts)
+    written["index.md"] = f"{HOW}\n| chapter | studies |\n| --- | --- |\n{''.join(contents)}{overview(results, titles)}"
+    return written
 
 
 ERRORS = {
@@ -231,8 +246,9 @@ def _summary(found: Mapping[str, float]) -> str:
 def main(args: Args) -> None:
     results = load(args.results)
     args.readme.write_text(fill(args.readme.read_text(), results))
-    args.page.write_text(page(results))
-    Console().print(f"wrote the tables of {args.readme} and {args.page}")
+    for name, text in pages(results).items():
+        (args.pages / name).write_text(text)
+    Console().print(f"wrote the tables of {args.readme} and {args.pages}")
 
 
 if __name__ == "__main__":

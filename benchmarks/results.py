@@ -20,7 +20,7 @@ from steadypose.benchmarks.provenance import RESULTS, ROOT, code, machine, measu
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PICTURES = ROOT / "docs" / "images"  # folder of the studies' pictures, which docs/results.md shows
+PICTURES = ROOT / "docs" / "images"  # folder of the studies' pictures, which docs/results/ shows
 READINGS = RESULTS / "test-readings.csv"
 """Log of every scoring of the test split. A split that is read often is being used for choices: if you change something
 after a reading, write the change into the last column."""

@@ -1,6 +1,6 @@
 """Biovision Hierarchy (.bvh) files.
 
-This is our own reader; `docs/results.md`, "Importers", compares packages. The format does not define what a position
+This is our own reader; `docs/results/`, "Importers", compares packages. The format does not define what a position
 channel means. In the original definition, it is added to the joint's OFFSET. Exporters that give every joint position
 channels write the whole offset into them, so there it replaces the OFFSET. Here it is added at a root, where the two
 differ only by a constant shift of the world (`prior.mocap.files` tells which has the feet on the floor), and replaces

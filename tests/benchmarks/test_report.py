@@ -12,7 +12,7 @@ from steadypose.benchmarks import output, provenance, results
 from steadypose.benchmarks.bench import Bench
 from steadypose.benchmarks.evaluate import Name, evaluate
 from steadypose.benchmarks.provenance import ROOT, UncommittedError, code, definitions, machine, measured, ships, stale
-from steadypose.benchmarks.report import ERRORS, STALE, Args, fill, main, overview, page, ratios
+from steadypose.benchmarks.report import ERRORS, STALE, Args, fill, main, overview, pages, ratios
 from steadypose.benchmarks.results import PICTURES, Result, Table, load, save, show
 from steadypose.benchmarks.studies import PREPARED, SENSORS, STUDIES
 from steadypose.benchmarks.systems import SYSTEMS
@@ -39,7 +39,7 @@ def test_a_saved_table_stands_in_every_block_of_the_readme_and_filling_twice_cha
     assert saved(tmp_path)["rows"] == [1, {"none": None}]
     readme = tmp_path / "README.md"
     readme.write_text(f"{TEXT}between\n{TEXT}")
-    main(Args(readme, tmp_path / "page.md", tmp_path))
+    main(Args(readme, tmp_path, tmp_path))
     once = readme.read_text()
     assert once.count("| steadypose | 0.5 | 3 |") == 2
     assert "| method | p50 | a\\|b |" in once
@@ -47,7 +47,7 @@ def test_a_saved_table_stands_in_every_block_of_the_readme_and_filling_twice_cha
     assert "old" not in once
     assert once.startswith("# Title\n")
     assert "<!-- /results -->\ntail\nbetween\n# Title" in once
-    main(Args(readme, tmp_path / "page.md", tmp_path))
+    main(Args(readme, tmp_path, tmp_path))
     assert readme.read_text() == once
     with pytest.raises(KeyError, match=r"results:other.*speed"):
         fill("<!-- results:other -->\n<!-- /results -->", {"latency": saved(tmp_path)})
@@ -60,14 +60,17 @@ def test_a_stale_table_has_its_reason_and_a_finished_study_its_commit(tmp_path: 
     assert "stale" not in fill(TEXT, results, {})
     assert "**stale: the reason**" in fill(TEXT, results, {"latency": "the reason"})
     assert "code is at commit abc1234" in fill(levels, results, {})
-    assert "**stale: the reason**" in page(results, {"latency": "the reason"})
+    assert "**stale: the reason**" in pages(results, {"latency": "the reason"})["speed-and-faults.md"]
 
 
-def test_the_page_shows_a_studys_pictures_and_refuses_a_result_that_no_chapter_names(tmp_path: Path) -> None:
+def test_a_page_shows_a_studys_pictures_and_refuses_a_result_that_no_chapter_names(tmp_path: Path) -> None:
     result = saved(tmp_path) | {"pictures": ["noise_levels"]}
-    assert "![noise levels](images/noise_levels.png)" in page({"latency": result})
+    written = pages({"latency": result})
+    assert set(written) == {"index.md", "speed-and-faults.md"}
+    assert "[Latency](speed-and-faults.md#latency)" in written["index.md"]
+    assert "![noise levels](../images/noise_levels.png)" in written["speed-and-faults.md"]
     with pytest.raises(KeyError, match=r"new_study.*chapter"):
-        page({"new_study": result})
+        pages({"new_study": result})
     shown = {stem for one in load().values() for stem in one.get("pictures", ())}
     assert shown == {path.stem for path in PICTURES.glob("*_*.png")}, "each is there"
 
@@ -177,12 +180,12 @@ def test_every_study_says_what_it_depends_on_and_is_made_of_code() -> None:
             assert len(code(f"benchmarks.{room}.{name}")) > 10, name
 
 
-def test_every_stale_result_is_listed_with_a_reason_and_readme_and_page_hold_what_was_measured() -> None:
+def test_every_stale_result_is_listed_with_a_reason_and_readme_and_pages_hold_what_was_measured() -> None:
     assert {name for name, result in load().items() if stale(result)} == set(STALE)
     results = load()
     readme = (ROOT / "README.md").read_text()
     assert fill(readme, results) == readme
-    assert page(results) == (ROOT / "docs" / "results.md").read_text()
+    assert pages(results) == {path.name: path.read_text() for path in (ROOT / "docs" / "results").iterdir()}
 
 
 def test_a_row_is_in_one_line_however_narrow_the_console() -> None:

@@ -60,7 +60,7 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
     ),
     (
         "docs/fit.md",
-        r"\(\[median\]\(results\.md#rotations\) (\S+) and (\S+) degrees\)",
+        r"\(\[median\]\(results/rotations-world-events\.md#rotations\) (\S+) and (\S+) degrees\)",
         [("rotations", "rotations", f"lasting, 2 cm: {method}", "17 joints")
          for method in ("`steadypose fit`, offline", "steadypose")],
     ),
