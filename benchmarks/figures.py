@@ -15,7 +15,7 @@ COLOURS = {
     "One-Euro": "#4c78a8",
     "Kalman, constant velocity": "#72b7b2",
     "Kalman, constant acceleration": "#54a24b",
-    "held beside the body": "#d8b5a5",
+    "held in the body frame": "#d8b5a5",
     "Gaussian + Hampel": "#b279a2",
     "bank of smoothers": "#1f6f5c",
     "whole-body bank": "#0b3d91",
@@ -77,7 +77,15 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float, int]]], title: s
     axis.fill_between(span, [0.8 * v for v in span], [1.2 * v for v in span], color="#444444", alpha=0.1, lw=0)
     for name, rows in bins.items():
         axis.plot([100 * s for s, _, _ in rows], [100 * f for _, f, _ in rows], marker="o", ms=4, label=name)
-    axis.set(xscale="log", yscale="log", xlim=span, ylim=span, aspect="equal", xlabel="stated, cm", ylabel="found, cm")
+    axis.set(
+        xscale="log",
+        yscale="log",
+        xlim=span,
+        ylim=span,
+        aspect="equal",
+        xlabel="standard deviation, cm",
+        ylabel="error, cm",
+    )
     for scale in (axis.xaxis, axis.yaxis):
         scale.set_major_locator(FixedLocator(_CENTIMETRES))
         scale.set_major_formatter("{x:g}")

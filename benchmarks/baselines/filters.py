@@ -148,7 +148,7 @@ def butterworth(seen: Floats, stamps_s: Floats, delay: int, cutoff_hz: float) ->
 BASELINES: tuple[Baseline, ...] = (
     Baseline("raw", raw, (0,)),
     Baseline("hold last", hold_last, (0,)),
-    Baseline("held beside the body", beside, (0,)),
+    Baseline("held in the body frame", beside, (0,)),
     Baseline("linear interpolation", interpolate),
     Baseline("One-Euro", one_euro, (0,), {"min_cutoff_hz": (0.1, 10.0), "beta": (0.05, 30.0)}),
     Baseline("Kalman, constant velocity", constant_velocity, None, {"density": (0.002, 50.0)}),

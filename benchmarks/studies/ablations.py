@@ -88,7 +88,7 @@ PARTS: Mapping[str, Part] = {
     ),
     "without slow error": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
-    "without denoising noise that lasts": Part(
+    "without denoising time-correlated noise": Part(
         PriorSettings(),
         lambda: mock.patch.object(
             Denoise,
@@ -119,7 +119,8 @@ PARTS_OF_THE_WORLD: Mapping[str, TrajectorySettings] = {
 CONDITIONS: Mapping[str, Condition] = {
     name: (noisy_joints.CONDITIONS | hidden_joints.CONDITIONS)[name]
     for name in (
-        "1 cm", "2 cm", "4 cm", "1 cm, sides", "lasting 2 cm", "lasting 2 cm, spikes, swaps", "0.5 s", "legs never"
+        "1 cm", "2 cm", "4 cm", "1 cm, sides", "correlated 2 cm", "correlated 2 cm, spikes, swaps", "0.5 s",
+        "legs unobserved",
     )
 }  # fmt: skip
 """Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
@@ -134,7 +135,7 @@ FLAGGING = (
 )
 """Parts that flags may depend on."""
 
-SOUND = ("1 cm", "lasting 2 cm")  # conditions without a fault
+SOUND = ("1 cm", "correlated 2 cm")  # conditions without a fault
 
 FAULTY = (
     "arms exchanged",
@@ -200,7 +201,7 @@ def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
     for name, settings in bench.progress.track(PARTS_OF_THE_WORLD.items(), description="world"):
         answer = chain(PriorSettings(), seen, clips.stamps_s, settings)[1]
         found = score(answer, clips.positions, missing(seen))
-        record = _record("lasting 2 cm", name, found.position, found.acceleration)
+        record = _record("correlated 2 cm", name, found.position, found.acceleration)
         feet = measure(clips, answer)
         record["standing_feet_m_s"] = round(0.5 * (feet["left_skate_m_s"] + feet["right_skate_m_s"]), 4)
         records.append(record)
@@ -209,7 +210,7 @@ def _world(bench: Bench, clips: MotionClips) -> list[dict[str, Any]]:
 
 def costs(clips: MotionClips) -> dict[str, float]:
     """Return milliseconds per frame of one body for each of `PARTS`: the mean over a clip."""
-    seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
+    seen = hidden_joints.CONDITIONS["arm unobserved"](clips.positions[:, :1], np.random.default_rng(0))
 
     def frames(part: Part) -> Floats:
         with part.replaced():
@@ -220,7 +221,7 @@ def costs(clips: MotionClips) -> dict[str, float]:
 
 def world_costs(clips: MotionClips) -> dict[str, float]:
     """Return the same for `PARTS_OF_THE_WORLD`, without the time of the prior before it."""
-    seen = hidden_joints.CONDITIONS["arm never"](clips.positions[:, :1], np.random.default_rng(0))
+    seen = hidden_joints.CONDITIONS["arm unobserved"](clips.positions[:, :1], np.random.default_rng(0))
     prior = PriorPipeline(PriorSettings(delay=DELAY))
     messages = list(product.stream(prior, seen, clips.stamps_s, calibrated=True))
 
@@ -262,8 +263,8 @@ def _flags_table(records: Sequence[Mapping[str, Any]], cost: Mapping[str, float]
         rows.append([name, *(f"{share:.1f}" for share in alarms), *(f"{share:.0f}" for share in found), spent])
     note = (
         f"{len(clips.offsets)} clips of {FRAMES} frames, delay {DELAY}. False alarms: percentage of frames. Faults: in "
-        f"noise that lasts, 2 cm, from frame {BEGINS} on or in the whole clip; percentage of clips with the fault that "
-        f"are flagged after frame {BEGINS}."
+        f"time-correlated noise of 2 cm, from frame {BEGINS} on or in the whole clip; percentage of clips with the "
+        f"fault that are flagged after frame {BEGINS}."
     )
     columns = ["", *(f"false alarms, {name}" for name in SOUND), *FAULTY, "ms a frame"]
     return Table("ablations-flags", f"What flags depend on, delay {DELAY}", columns, rows, note)

@@ -136,6 +136,6 @@ def calibration_table(calibration: Sequence[Mapping[str, Any]], name: str) -> Ta
     hidden = any("hidden" in row for row in calibration)
     return pivot(
         records, "condition", "cell", name,
-        "Error found by standard deviation stated" + (": seen / hidden joints" if hidden else ""),
+        "Error-to-sigma ratio" + (": observed / hidden joints" if hidden else ""),
         "Root mean square of their ratio along an axis: 1 is honest, above is too sure of itself.",
     )  # fmt: skip

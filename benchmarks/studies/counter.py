@@ -40,7 +40,7 @@ PEOPLE = (3601, 3602)
 """Seeds of the people of each scene. They chose nothing: seeds 1 to 20 did, and 3501 and 3502 showed what to mend."""
 _LEGS = np.ravel(limbs(("knee", "ankle", "foot"))).tolist()
 COUNTERS = {
-    "legs seen": [],
+    "legs observed": [],
     "knees and below hidden": _LEGS,
     "hips and below hidden": [J["pelvis"], *HIPS, *_LEGS],
 }
@@ -153,12 +153,13 @@ def _table(pooled: Mapping[str, Mapping[str, Floats]], people: int) -> Table:
         "counter", "People behind a counter, filmed with a Kinect's errors",
         ["method", "facing p50, °", "p95, °", "place on the floor, mm", "height of the hips, mm",
                  "of the head, mm", "sitting or standing right, %", "contacts of legs published, %", "feet, mm",
-                 "feet, by stated"],
+                 "feet, error-to-sigma"],
         rows,
         f"{people} simulated people, who walk, sit down and rise, reach (lean and bend) or idle; delay "
         f"{PriorSettings().delay}; a calibrated camera 1.4 m high. Hidden throughout, as by a counter whose edge the "
         "camera sees about 0.5 m (knees) or 1 m (hips) above the floor at a standing person. Means over frames after "
         "the first second. Facing is normal to hips and shoulders. Frames between standing upright and sitting are "
         "left out. Bank and rules: what is seen, smoothed by the whole-body bank; facing across the shoulders; stands "
-        f"if the hips are above {UP} m; hidden hips are {TRUNK:.2f} m under the shoulders. By stated: 1 is honest.",
+        f"if the hips are above {UP} m; hidden hips are {TRUNK:.2f} m under the shoulders. Error-to-sigma ratio: 1 is "
+        "calibrated.",
     )  # fmt: skip

@@ -39,7 +39,7 @@ from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = VARIANTS_22
 
-BESIDE = "held beside the body"
+BESIDE = "held in the body frame"
 GAUSSIAN = "conditional Gaussian"
 FILTER = "Kalman, whole body"
 KNOW_THE_BODY = (BESIDE, GAUSSIAN, FILTER)  # baselines that use the whole body, unlike a filter for each joint
@@ -76,8 +76,8 @@ CONDITIONS: dict[str, Condition] = {
     "below 0.9 m": partial(_masked, mask=lambda truth, _: below(truth)),
     "arm behind": partial(_masked, mask=lambda truth, _: arm_behind(truth)),
     **{f"{s:g} s": partial(_masked, mask=partial(_burst, seconds=s)) for s in BURSTS_S},
-    "legs never": partial(_without, joints=_LEGS),
-    "arm never": partial(_without, joints=_ARM),
+    "legs unobserved": partial(_without, joints=_LEGS),
+    "arm unobserved": partial(_without, joints=_ARM),
 }
 
 
@@ -93,14 +93,14 @@ def run(bench: Bench) -> Result:
     data = run_conditions(bench, clips, {name: CONDITIONS[name] for name in kept}, baselines)
     records = data["records"]
     note = (
-        f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those seen; "
-        f"the first {SEEN_FIRST} frames of a clip are seen in full. A duration: one lower arm or leg is away for so "
-        f"long. Never: knees and all below them, or an arm, in no frame of a clip. {GAUSSIAN}: the mean of what is "
-        f"hidden given what the whole-body bank makes of what is seen, of one Gaussian over training poses; where "
-        f"neither hips nor shoulders are seen, {BESIDE}. {HOW}"
+        f"{clips.positions.shape[1]} clips of {len(clips.positions)} frames, 22 joints, 1 cm of noise on those "
+        f"observed; the first {SEEN_FIRST} frames of a clip are observed in full. A duration: one lower arm or leg is "
+        f"away for so long. Unobserved: knees and all below them, or an arm, in no frame of a clip. {GAUSSIAN}: the "
+        f"mean of what is hidden given what the whole-body bank makes of what is seen, of one Gaussian over training "
+        f"poses; where neither hips nor shoulders are seen, {BESIDE}. {HOW}"
     )
     sources = by_source(records, "hidden", 4, clips, "hidden_joints-sources", "Hidden joints: their error")
-    groups = (("hidden", "hidden joints"), ("seen", "seen joints"))
+    groups = (("hidden", "hidden joints"), ("seen", "observed joints"))
     tables: list[Table] = [_summary_table(records, note), sources]
     tables += [
         pivot(records, "condition", f"{group}_mm", "hidden_joints" if group == "hidden" else "hidden_joints-seen",
@@ -118,7 +118,7 @@ def run(bench: Bench) -> Result:
     pictures = {
         "hidden_bursts": figures.curves(
             [r for r in timed if r["delay"] == 4 or r["method"] in ("hold last", "One-Euro")], "seconds",
-            {"hidden_mm": "error of hidden joints, mm", "seen_mm": "error of seen joints, mm"},
+            {"hidden_mm": "error of hidden joints, mm", "seen_mm": "error of observed joints, mm"},
             "a limb is away for, s", "Bursts, delay of at most 4 frames",
         )
     }  # fmt: skip

@@ -174,7 +174,7 @@ DELAY = 8  # delay of the live output from which fits start, frames
 CLIPS, PICTURES, FUTURES = 4, 8, 12
 """Number of clips of Table 2, of Tables 3 and 4, and of Table 1, taken evenly from all sources of the split."""
 
-_STILL, _RAW, _TRUTH = "stands still", "as seen", "truth"
+_STILL, _RAW, _TRUTH = "stands still", "as observed", "truth"
 _PER_FRAME = "per-frame fit, smoothed (stage 2)"
 
 
@@ -259,7 +259,7 @@ def _futures_table(records: Sequence[dict[str, Any]], clips: int) -> Table:
 
 def _fit_tables(records: dict[str, list[dict[str, Any]]], few: int) -> list[Table]:
     keys = {
-        "all_mm": "all, mm", "seen_mm": "seen, mm", "hidden_mm": "hidden, mm", "legs_mm": "legs, mm",
+        "all_mm": "all, mm", "seen_mm": "observed, mm", "hidden_mm": "hidden, mm", "legs_mm": "legs, mm",
         "rooted_mm": "from the root, mm", "contact_accuracy": "contact accuracy",
         "acceleration_m_s2": "acceleration, m/s²",
         "acceleration_error_m_s2": "its error, m/s²", "penetration_percent": "penetration, %",

@@ -28,7 +28,7 @@ FRAMES, GAPS = 75, (5, 15, 30)
 NOISES: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
     "none": lambda truth, rng: truth,
     "white, 1 cm": lambda truth, rng: gaussian(truth, 0.01, rng),
-    "lasting, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
+    "correlated, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
 }
 AWAY = {
     "the body": list(range(22)),

@@ -110,7 +110,7 @@ def run(bench: Bench) -> Result:
             {"position_mm": "position error, mm", "acceleration_mm": "acceleration error, mm/frame²"},
             "delay, frames at 30 Hz", "Real Kinect against Vicon, each of eight people left out",
         ),
-        "kinect_reliability": figures.reliability(reliabilities, "Real Kinect: stated and found"),
+        "kinect_reliability": figures.reliability(reliabilities, "Real Kinect: error and its standard deviation"),
     }  # fmt: skip
     return Result([_table(records, clips, subjects), _deviation_table(deviations, subjects)], data, pictures)
 
@@ -153,7 +153,7 @@ def _deviation_table(deviations: Mapping[tuple[str, int], dict[str, Any]], subje
     keys = {
         "rank_correlation": "rank correlation", "auroc_off": "AUROC, joint off by 10 cm",
         "auroc_worst": "AUROC, worst tenth of frames", "auroc_worst_anomaly": "of the anomaly",
-        "found_by_stated": "found by stated", "flagged_percent": "flagged, %",
+        "found_by_stated": "error-to-sigma", "flagged_percent": "flagged, %",
     }  # fmt: skip
     rows = [
         [f"{person}, {text}", *("–" if (v := deviations[name, 4][person][key]) is None else f"{v:.2f}" for key in keys)]

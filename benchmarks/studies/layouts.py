@@ -62,7 +62,7 @@ def run(bench: Bench) -> Result:
     for number, layout in enumerate(LAYOUTS):
         for counter in (False, True):
             joints = sensed(clips, layout, np.random.default_rng((number, counter)), counter=counter)
-            head = {"layout": layout, "case": "no hips or legs" if counter else "all seen"}
+            head = {"layout": layout, "case": "no hips or legs" if counter else "all observed"}
             seen, _ = to_canonical(SKELETONS[layout], joints)
             if not counter:  # without hips, a Gaussian about the root has no answer
                 filtered = given_the_seen(seen, clips.stamps_s, DELAY, gaussian)

@@ -33,19 +33,19 @@ LEVELS_CM = (1, 2, 4, 8)
 
 CONDITIONS: dict[str, Condition] = {
     **{f"{cm} cm": lambda truth, rng, cm=cm: gaussian(truth, cm / 100, rng) for cm in LEVELS_CM},
-    "lasting 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
+    "correlated 2 cm": lambda truth, rng: correlated(truth, 0.02, rng),
     "1 cm, spikes": lambda truth, rng: spiked(gaussian(truth, 0.01, rng), rng),
     "1 cm, swaps": lambda truth, rng: swapped(gaussian(truth, 0.01, rng), rng),
     "1 cm, sides": lambda truth, rng: sides_exchanged(gaussian(truth, 0.01, rng), rng),
-    "lasting 2 cm, spikes, swaps": lambda truth, rng: spiked(swapped(correlated(truth, 0.02, rng), rng), rng),
+    "correlated 2 cm, spikes, swaps": lambda truth, rng: spiked(swapped(correlated(truth, 0.02, rng), rng), rng),
 }
-"""Conditions by standard deviation along an axis; "lasting": correlation 0.9 between frames; "swaps": limbs exchanged
+"""Conditions by standard deviation along an axis; "correlated": by 0.9 between frames; "swaps": limbs exchanged
 for a few frames; "sides": the whole body exchanged for a second."""
 
 
 def run(bench: Bench) -> Result:
     clips = bench.clips()
-    kept = ("4 cm", "lasting 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
+    kept = ("4 cm", "correlated 2 cm, spikes, swaps") if bench.quick else tuple(CONDITIONS)
     track = partial(bench.progress.track, description="FLK")
     net = flk.train(bench.training_clips(), 50 if bench.quick else 3000, 0, track)
     filters = (*FILTERS, Baseline("FLK", partial(flk.filtered, net), (0,), flk.SPACE, whole_body=True))

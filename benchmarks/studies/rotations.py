@@ -50,7 +50,7 @@ DEPENDS_ON = (*VARIANTS_22, "humor weights", "prior.fit")
 
 DELAY, FIT_DELAY = PriorSettings().delay, 8
 """Delays of the live output that is scored, and of that from which fits start, frames."""
-LASTING = math.exp(-1.0 / (0.5 * FPS))  # correlation between frames of noise that lasts for half a second (to 1 / e)
+CORRELATION = math.exp(-1.0 / (0.5 * FPS))  # between frames; 1 / e over half a second
 CAMERA_M, DEPTH = 4.0, 4.0
 """Distance of a camera from the middle of a clip, metres; its errors along the line of sight over those across it."""
 PERFECT, AIMED, STEADYPOSE, FIT = "none", "aimed bones", "steadypose", "`steadypose fit`, offline"
@@ -64,8 +64,8 @@ METHODS: Mapping[str, PriorSettings] = {
 
 
 def depth_errors(truth: Floats, rng: np.random.Generator) -> Floats:
-    """Add noise to (T, C, 22, 3) that lasts, 1 cm across the line of sight of a camera and 4 cm along it."""
-    seen = correlated(truth, 0.01, rng, LASTING)
+    """Add time-correlated noise to (T, C, 22, 3), 1 cm across the line of sight of a camera and 4 cm along it."""
+    seen = correlated(truth, 0.01, rng, CORRELATION)
     sight = truth - truth.mean(axis=(0, 2), keepdims=True) - (CAMERA_M, 0.0, 0.0)
     sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
     return seen + (DEPTH - 1.0) * ((seen - truth) * sight).sum(axis=-1, keepdims=True) * sight
@@ -75,8 +75,8 @@ CONDITIONS: Mapping[str, Callable[[Floats, np.random.Generator], Floats]] = {
     PERFECT: lambda truth, _: truth,
     "white, 1 cm": lambda truth, rng: gaussian(truth, 0.01, rng),
     "white, 2 cm": lambda truth, rng: gaussian(truth, 0.02, rng),
-    "lasting, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng, LASTING),
-    "a camera's depth, lasting": depth_errors,
+    "correlated, 2 cm": lambda truth, rng: correlated(truth, 0.02, rng, CORRELATION),
+    "a camera's depth, correlated": depth_errors,
 }
 """Errors of joints (T, C, 22, 3), metres."""
 

@@ -84,7 +84,7 @@ def run(bench: Bench) -> Result:
         (baseline.name for baseline in baselines if baseline.name in errors), key=lambda name: errors[name].mean()
     )
     sources = source_table(
-        "world-sources", f"In the world, through noise of 2 cm that lasts: joints by source, mm, delay {DELAY}",
+        "world-sources", f"In the world, through time-correlated noise of 2 cm: joints by source, mm, delay {DELAY}",
         {("no alignment", name): found for name, found in errors.items()}, clips, best,
     )  # fmt: skip
     data = {
@@ -325,7 +325,7 @@ def evaluate_fusion(clips: list[Clip]) -> dict[str, Errors]:
 
 def _table(records: list[dict[str, Any]], clips: int) -> Table:
     return Table.of(
-        "world", "In the world, through noise of 2 cm that lasts: place, pose and standing feet", records,
+        "world", "In the world, through time-correlated noise of 2 cm: place, pose and standing feet", records,
         {"method": "{method}", "delay, frames": "{delay}", "joints, mm": "{position_mm:.1f}",
          "legs, mm": "{legs_mm:.1f}", "root, mm": "{root_mm:.1f}",
          "acceleration error, mm/frame²": "{acceleration_mm:.2f}", "left foot, m/s": "{left_skate_m_s:.3f}",
@@ -342,11 +342,11 @@ def _table(records: list[dict[str, Any]], clips: int) -> Table:
 def _root_table(by_speed: Mapping[str, Mapping[str, float]]) -> Table:
     return Table(
         "world-root",
-        "The root and its velocity by true speed: RMS error along an axis, found by standard deviation stated",
-        ["m/s", "frames", "root, mm", "by stated", "velocity, m/s", "by stated"],
+        "The root and its velocity by true speed: RMS error along an axis, and error-to-sigma ratio",
+        ["m/s", "frames", "root, mm", "error-to-sigma", "velocity, m/s", "error-to-sigma"],
         [[name, str(r["frames"]), f"{r['position_mm']:.1f}", f"{r['position_ratio']:.2f}",
           f"{r['velocity_m_s']:.3f}", f"{r['velocity_ratio']:.2f}"] for name, r in by_speed.items()],
-        "The same clips. By stated: 1 is honest.",
+        "The same clips. Error-to-sigma ratio: 1 is calibrated.",
     )  # fmt: skip
 
 

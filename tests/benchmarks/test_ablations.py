@@ -13,7 +13,7 @@ REPLACED = {
     "without putting sides back",
     "without the whole-body experts",
     "without the share of white noise",
-    "without denoising noise that lasts",
+    "without denoising time-correlated noise",
     "without straight paths",
 }
 

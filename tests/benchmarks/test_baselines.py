@@ -111,7 +111,7 @@ def test_no_answer_knows_more_than_its_delay(baseline) -> None:
 
 
 def test_only_what_fills_gaps_alone_is_no_filter() -> None:
-    fill_gaps = {"hold last", "held beside the body", "linear interpolation"}
+    fill_gaps = {"hold last", "held in the body frame", "linear interpolation"}
     assert {baseline.name for baseline in BASELINES} - {baseline.name for baseline in FILTERS} == fill_gaps
 
 

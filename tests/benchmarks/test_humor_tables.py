@@ -65,5 +65,5 @@ def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
         assert all(len(row) == len(table.columns) for row in table.rows)
         assert any(row[0] in (SHIPS, "4 cm of noise: as it ships") for row in table.rows)
     noisy = {record["method"]: record for record in result.data["records"]["noisy"]}
-    assert noisy[SHIPS]["all_mm"] < noisy["as seen"]["all_mm"]
+    assert noisy[SHIPS]["all_mm"] < noisy["as observed"]["all_mm"]
     assert noisy["truth"]["all_mm"] == 0.0

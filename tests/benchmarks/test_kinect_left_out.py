@@ -311,7 +311,7 @@ def test_a_constant_offset_in_the_body_is_learned_on_one_subject_and_taken_from_
     without = kinect_methods.score(asked, aligned, np.zeros_like(offset))
     corrected = kinect_methods.score(asked, aligned, offset)
     assert without.position.mean() > 0.03
-    # The trunk's frame is that of the joints as seen, which an offset tilts a little.
+    # The trunk's frame is that of the joints as observed, which an offset tilts a little.
     assert corrected.position.mean() < 0.2 * without.position.mean()
     # without the clip_of's own constant offset, what moves is as little, whatever offset was learned
     assert without.moving.mean() < 0.2 * without.position.mean()

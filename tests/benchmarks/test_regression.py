@@ -24,7 +24,7 @@ GOLDEN = {
     "arm behind": (7.7, 46.4, 2.92),
     "0.5 s": (6.4, 44.5, 2.72),
     "4 cm": (18.5, None, 6.15),
-    "lasting 2 cm, spikes, swaps": (26.3, None, 2.23),
+    "correlated 2 cm, spikes, swaps": (26.3, None, 2.23),
 }
 WORSE = 1.1
 

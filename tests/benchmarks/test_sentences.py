@@ -19,13 +19,13 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
         [
             ("fidelity", "fidelity-sources-4", "2 cm: steadypose", OF_BANK),
             ("fidelity", "fidelity-sources-0", "2 cm: steadypose", OF_BANK),
-            ("noisy_joints", "noisy_joints-sources-4", "lasting 2 cm: steadypose", OF_BANK),
+            ("noisy_joints", "noisy_joints-sources-4", "correlated 2 cm: steadypose", OF_BANK),
         ],
     ),
     (
         "README.md",
         r"with COCO's joints, in independent noise of 2 cm, the mean error is (\S+) mm instead of (\S+) ",
-        [("layouts", "layouts", f"{layout}, all seen: steadypose", "all, mm") for layout in ("coco17", "smpl22")],
+        [("layouts", "layouts", f"{layout}, all observed: steadypose", "all, mm") for layout in ("coco17", "smpl22")],
     ),
     ("README.md", r"Two cores .* \(AMD EPYC\) carry (\d+) people", [("latency", "live", "32", "bodies answered")]),
     (
@@ -61,7 +61,7 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
     (
         "docs/fit.md",
         r"\(\[median\]\(results/rotations-world-events\.md#rotations\) (\S+) and (\S+) degrees\)",
-        [("rotations", "rotations", f"lasting, 2 cm: {method}", "17 joints")
+        [("rotations", "rotations", f"correlated, 2 cm: {method}", "17 joints")
          for method in ("`steadypose fit`, offline", "steadypose")],
     ),
     (
