@@ -26,7 +26,6 @@ MAX_VALUES = 1000
 """Largest number of entries in one node's diagnostics."""
 MAX_NAME = 1024
 """Largest size of a name (source, frame, layout) in UTF-8, bytes. Every node remembers a thousand sources."""
-
 _HEADER = "iIs"
 # the fields before the limited count, by struct's format characters with s for a string; and the limit
 _BEFORE = {
@@ -42,10 +41,8 @@ _BEFORE = {
 def check_size(topic: str, payload: bytes | memoryview) -> None:
     """Check the number of bodies, events or values in an encoded message, and its names, before it is decoded.
 
-    A megabyte of bodies without joints would take seconds to decode, and would block all other messages.
-
-    Raises:
-        ValueError: a number exceeds its limit.
+    A megabyte of bodies without joints would take seconds to decode, and would block all other messages. Raises
+    ValueError if a number exceeds its limit.
     """
     before, most = _BEFORE[topic]
     order = "<" if len(payload) > 1 and payload[1] & 1 else ">"
@@ -121,10 +118,8 @@ def encode(message: Message) -> bytes:
 def decode(topic: str, payload: bytes | memoryview) -> Message:
     """Decode a message of `topic` from CDR of either byte order. Its arrays are copies.
 
-    Lengths are checked against the size of the payload before memory is allocated.
-
-    Raises:
-        DecodeError: the topic is unknown, or the bytes are not a message of its type.
+    Raises DecodeError if the topic is unknown, or the bytes are not a message of its type. Lengths are checked before
+    memory is allocated.
     """
     if topic not in TOPICS:
         raise DecodeError(f"unknown topic {topic!r}: expected one of {', '.join(TOPICS)}")
@@ -220,11 +215,8 @@ def _header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def _pose(position: NDArray[Any], orientation: NDArray[Any]) -> Any:
-    types = typestore().types
-    return types["geometry_msgs/msg/Pose"](
-        types["geometry_msgs/msg/Point"](*position.tolist()),
-        types["geometry_msgs/msg/Quaternion"](*orientation.tolist()),
-    )
+    pose, point, quaternion = (typestore().types[f"geometry_msgs/msg/{x}"] for x in ("Pose", "Point", "Quaternion"))
+    return pose(point(*position.tolist()), quaternion(*orientation.tolist()))
 
 
 def _xyz(wire: Any) -> NDArray[np.float64]:
@@ -239,12 +231,9 @@ def _xyzw(pose: Any) -> NDArray[np.float64]:
 def _diagnostics_to_wire(m: Diagnostics) -> Any:
     types = typestore().types
     pair = types["diagnostic_msgs/msg/KeyValue"]
+    values: list[Any] = [pair(key, value) for key, value in m.values.items()]
     status = types["diagnostic_msgs/msg/DiagnosticStatus"](
-        level=int(m.level),
-        name=m.node,
-        message=m.message,
-        hardware_id="",
-        values=[pair(key, value) for key, value in m.values.items()],
+        level=int(m.level), name=m.node, message=m.message, hardware_id="", values=values
     )
     return types["diagnostic_msgs/msg/DiagnosticArray"](header=_header(m.stamp_ns, ""), status=[status])
 
@@ -253,10 +242,5 @@ def _diagnostics_from_wire(w: Any) -> Diagnostics:
     if len(w.status) != 1:
         raise ValueError(f"status: expected one, got {len(w.status)}")
     status = w.status[0]
-    return Diagnostics(
-        stamp_ns=_nanoseconds(w.header.stamp),
-        node=status.name,
-        level=Level(status.level),
-        message=status.message,
-        values={pair.key: pair.value for pair in status.values},
-    )
+    values = {pair.key: pair.value for pair in status.values}
+    return Diagnostics(_nanoseconds(w.header.stamp), status.name, Level(status.level), status.message, values)

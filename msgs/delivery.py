@@ -90,12 +90,11 @@ def read_taken(frame: bytes, topics: Collection[str]) -> Taken | None:
 WINDOW = 256
 """Number of unacknowledged messages of a topic at which the publisher waits for a reliable subscriber.
 
-Together with `MAX_CONTEXT` and other messages it stays below ZeroMQ's queue for a subscriber, so ZeroMQ drops none."""
+With `MAX_CONTEXT` and other messages it stays below ZeroMQ's queue for a subscriber, so ZeroMQ drops none."""
 MAX_CONTEXT = 512
 """Largest number of acknowledged messages that a subscriber can request as context."""
 DEAF_S = 10.0
-"""Time without a sign of life after which the publisher no longer waits for a subscriber that has unread messages,
-seconds."""
+"""Silence after which the publisher no longer waits for a subscriber that has unread messages, seconds."""
 WRAP = 2**32
 """Modulus of sequence numbers, which are uint32."""
 
@@ -152,26 +151,21 @@ class Deliveries:
         self._live[listener] = self._last[listener.name] = progress = _Progress(
             following, min(max(listener.context, 0), MAX_CONTEXT), time.monotonic()
         )
-        return [
-            frame
-            for topic, sequence, frame in self._kept
-            if topic in following and _ahead(sequence + progress.context, following[topic])
-        ]
+        kept = [(frame, sequence, following[topic]) for topic, sequence, frame in self._kept if topic in following]
+        return [frame for frame, sequence, expected in kept if _ahead(sequence + progress.context, expected)]
 
     def leave(self, listener: Listener) -> None:
         """Record that a subscriber disconnected."""
-        gone = self._live.pop(listener, None)
+        gone, name = self._live.pop(listener, None), listener.name
         if gone is None:
             return
-        last = self._last[listener.name]
-        if last is gone:
-            same = (progress for other, progress in self._live.items() if other.name == listener.name)
-            self._last[listener.name] = next((progress for progress in same if not self._is_deaf(progress)), gone)
-        elif self._is_deaf(last):
-            self._last[listener.name] = gone
+        if self._last[name] is gone:
+            same = (progress for other, progress in self._live.items() if other.name == name)
+            self._last[name] = next((progress for progress in same if not self._is_deaf(progress)), gone)
+        elif self._is_deaf(self._last[name]):
+            self._last[name] = gone
 
     def leave_all(self) -> None:
-        """Record that all subscribers were disconnected."""
         for listener in list(self._live):
             self.leave(listener)
 

@@ -30,13 +30,12 @@ class Array(NamedTuple):
             array = np.asarray(value, self.dtype)
         except (TypeError, ValueError, OverflowError) as error:
             raise UnfitError(f"{self.dtype.__name__} numbers of shape {self}", repr(value)[:80]) from error
-        if array.shape != self.shape and not self._fits(array.shape):
+        fits = array.shape == self.shape or (
+            array.ndim == len(self.shape) and all(a in ("J", b) for a, b in zip(self.shape, array.shape, strict=True))
+        )
+        if not fits:
             raise UnfitError(f"shape {self}", f"shape {array.shape}")
         return array
-
-    def _fits(self, shape: tuple[int, ...]) -> bool:
-        own = self.shape
-        return len(own) == len(shape) and all(a in ("J", b) for a, b in zip(own, shape, strict=True))
 
     def __str__(self) -> str:
         return str(self.shape).replace("'", "")

@@ -36,21 +36,11 @@ FILE_RATIO_FROM = 2**24
 """Decompressed size that any file's chunks may reach together, bytes. Beyond it, `MAX_RATIO` times the file size."""
 MIN_RECORD = 31
 """Size of a message record without content, bytes. It bounds the plausible number of records in a chunk."""
-
 BROKEN = (
-    McapError,
-    ValueError,
-    KeyError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    OverflowError,
-    MemoryError,
-    struct.error,
-    zstandard.ZstdError,
+    *(ValueError, KeyError, EOFError, OSError, RuntimeError, OverflowError, MemoryError),
+    *(McapError, struct.error, zstandard.ZstdError),
 )
 """Exceptions that the libraries raise for bytes that are not MCAP."""
-
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, decompressed size, its checksum, length of the compression's name
@@ -83,34 +73,24 @@ class Logged(NamedTuple):
 
 
 class McapFile:
-    """The content of an MCAP file, intact or damaged.
+    """The content of an MCAP file, intact or damaged: ``file``, open for reading, of ``size`` bytes.
 
-    Args:
-        file: file opened for reading; it stays open.
-        size: its size, bytes.
-        scan: whether to scan a file without a valid index.
-
-    Attributes:
-        channels: channels by id.
-        schemas: schemas by id.
-        counts: number of messages by channel. Counts from the index include messages in damaged chunks.
-        places: positions of the chunks.
-        complete: whether the writer finished the file.
-        lost_bytes: number of unreadable bytes known so far; complete once all messages were read.
-        gaps: number of unreadable pieces.
-
-    Raises:
-        ValueError: nothing in the file looks like MCAP, or it has no index and is not to be scanned.
+    ``scan`` says whether to scan a file without a valid index. Raises ValueError if that is missing and not scanned
+    for, or nothing in the file looks like MCAP.
     """
 
     def __init__(self, file: IO[bytes], size: int, *, scan: bool = True) -> None:
-        self._file = file
-        self._size = size
+        self._file, self._size = file, size
         self.channels: dict[int, Channel] = {}
+        """by id"""
         self.schemas: dict[int, Schema] = {}
+        """by id"""
         self.counts: Counter[int] = Counter()
+        """number of messages by channel; those from the index include messages in damaged chunks"""
         self.places: list[Place] = []
+        """positions of the chunks"""
         self.complete = True
+        """whether the writer finished the file"""
         self._lost: dict[int, int] = {}
         self._left = 0  # bytes that may still be decompressed in this pass over the file
         begins = file.read(len(_MAGIC)) == _MAGIC
@@ -127,10 +107,12 @@ class McapFile:
 
     @property
     def lost_bytes(self) -> int:
+        """Number of unreadable bytes known so far; complete once all messages were read."""
         return sum(self._lost.values())
 
     @property
     def gaps(self) -> int:
+        """Number of unreadable pieces known so far."""
         return len(self._lost)
 
     @property
@@ -182,11 +164,7 @@ class McapFile:
                 yield channel, log_ns, data[_MESSAGE.size :]
 
     def _record_at(self, offset: int) -> tuple[int, bytes]:
-        """The opcode and content of the record at ``offset``.
-
-        Raises:
-            ValueError: the record extends beyond the end of the file.
-        """
+        """Opcode and content of the record at ``offset``. Raises ValueError if it extends beyond the file's end."""
         self._file.seek(offset)
         opcode, length = _RECORD.unpack(self._file.read(_RECORD.size))
         if offset + _RECORD.size + length > self._size:
@@ -262,10 +240,8 @@ class McapFile:
                 self.counts += counts
 
     def _take(self, at: int, places: list[tuple[Place, Counter[int]]]) -> int:
-        """Register the content of the record at ``at``. Returns the offset of the next record.
-
-        Raises:
-            BROKEN: the bytes are not a record, or the record is damaged.
+        """Register the record at ``at``; returns the offset of the next. Raises one of `BROKEN` if it is none, or
+        damaged.
         """
         opcode, body = self._record_at(at)
         length = _RECORD.size + len(body)
@@ -323,11 +299,7 @@ def _parse(kind: type[_Record], body: bytes | memoryview) -> _Record:
 
 
 def _decompressed(body: bytes, most: int) -> bytes | memoryview:
-    """The decompressed content of a chunk's record.
-
-    Raises:
-        BROKEN: the checksum is wrong, or the content exceeds ``most`` bytes or another limit.
-    """
+    """The decompressed content of a chunk's record. Raises one of `BROKEN` if its checksum or a size is wrong."""
     _, _, size, checksum, name_length = _CHUNK.unpack_from(body)
     at = _CHUNK.size + name_length
     name = body[_CHUNK.size : at].decode()

@@ -18,15 +18,7 @@ import zmq
 from steadypose.msgs import Closing
 from steadypose.msgs.codec import check_size, encode, typestore
 from steadypose.msgs.delivery import MAX_FRAME, PREFIX, VERSION, Deliveries, Listener, read_subscription, read_taken
-from steadypose.msgs.security import (
-    Keys,
-    TransportError,
-    is_local,
-    loopback_keys,
-    make_private,
-    parse,
-    refuse_used,
-)
+from steadypose.msgs.security import Keys, TransportError, is_local, loopback_keys, make_private, parse, refuse_used
 from steadypose.msgs.topics import TOPICS, check_topic
 from steadypose.msgs.types import Message
 
@@ -43,10 +35,8 @@ MAX_NEW_SUBSCRIPTIONS = 256
 """Number of new subscriptions in a second at which a connection is closed."""
 REBIND_S = 5.0
 """Longest time to wait for our own address, seconds. ZeroMQ releases it in a thread, soon after the socket closes."""
-
 CHECK_S = 1.0
 """Interval between two enforcements of the list of keys while messages are published, seconds."""
-
 _LOOK_S = 1.0
 """Interval between checks whether a subscriber still has to be waited for, seconds."""
 _CUT = "subscriptions"
@@ -99,10 +89,8 @@ class Publisher(Closing):
         """
         transport, host = parse(endpoint)
         if keys is None and not clear_text and not is_local(endpoint):
-            raise TransportError(
-                f"{endpoint} can be reached from other machines: expected keys, got none; "
-                "make them with `steadypose keys`, or bind tcp://127.0.0.1"
-            )
+            remedy = "make them with `steadypose keys`, or bind tcp://127.0.0.1"
+            raise TransportError(f"{endpoint} can be reached from other machines: expected keys, got none; {remedy}")
         if keys is None and transport == "tcp" and not clear_text:
             keys = loopback_keys()
         typestore()
@@ -125,23 +113,19 @@ class Publisher(Closing):
                 make_private(Path(host).parent)
                 refuse_used(Path(host))
             self._socket = self._bind(endpoint)
-        except zmq.ZMQError as error:
+        except (zmq.ZMQError, TransportError) as error:
             self._end()
+            if isinstance(error, TransportError):
+                raise
             raise TransportError(f"cannot publish at {endpoint}: {error.strerror}") from error
-        except TransportError:
-            self._end()
-            raise
         self.endpoint: str = self._socket.get_string(zmq.LAST_ENDPOINT)
 
     def _bind(self, endpoint: str) -> zmq.Socket[bytes]:
         # XPUB, unlike PUB, receives the subscriptions
         socket = self._context.socket(zmq.XPUB)
         try:
-            socket.setsockopt(zmq.SNDHWM, SEND_HIGH_WATER)
-            socket.setsockopt(zmq.LINGER, LINGER_MS)
-            socket.setsockopt(zmq.MAXMSGSIZE, 1024)
-            socket.setsockopt(zmq.IPV6, "[" in endpoint)
-            for option, value in KEEPALIVE.items():
+            limits = {zmq.SNDHWM: SEND_HIGH_WATER, zmq.LINGER: LINGER_MS, zmq.MAXMSGSIZE: 1024}
+            for option, value in (KEEPALIVE | limits | {zmq.IPV6: "[" in endpoint}).items():
                 socket.setsockopt(option, value)
             if self._keys:
                 socket.curve_server = True
@@ -160,8 +144,6 @@ class Publisher(Closing):
         """Send a message to all subscribers of its topic.
 
         Args:
-            topic: its topic.
-            message: the message.
             timeout_s: longest time to wait for reliable subscribers that are behind, seconds.
 
         Returns:
@@ -312,12 +294,7 @@ class Publisher(Closing):
         self._context.term()
 
 
-KEEPALIVE = {
-    zmq.TCP_KEEPALIVE: 1,
-    zmq.TCP_KEEPALIVE_IDLE: 5,
-    zmq.TCP_KEEPALIVE_INTVL: 5,
-    zmq.TCP_KEEPALIVE_CNT: 2,
-}
+KEEPALIVE = {zmq.TCP_KEEPALIVE: 1, zmq.TCP_KEEPALIVE_IDLE: 5, zmq.TCP_KEEPALIVE_INTVL: 5, zmq.TCP_KEEPALIVE_CNT: 2}
 """Socket options by which a vanished machine is detected within 15 s.
 
 ZeroMQ's own heartbeats would abort the process of a subscriber that is behind (libzmq issue 3937)."""

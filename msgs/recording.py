@@ -44,8 +44,7 @@ class RecordingReader(Closing):
     def __init__(self, path: str | Path) -> None:
         """Open a rosbag2 directory, with or without `metadata.yaml`, or a single `.mcap` file.
 
-        Raises:
-            RecordingError: there is no recording, it has no messages, or it was made with other message definitions.
+        Raises RecordingError if there is no recording, or it has no messages, or other message definitions.
         """
         self.path = Path(path)
         self.refused: Counter[str] = Counter()
@@ -59,10 +58,8 @@ class RecordingReader(Closing):
             self._parts = [self._open(file) for file in files]
             self._counts = self._count()
             if not self._counts:
-                raise RecordingError(
-                    f"{self.path} holds no message on any of {', '.join(TOPICS)}; "
-                    f"{self.lost_bytes} bytes could not be read"
-                )
+                lost = f"{self.lost_bytes} bytes could not be read"
+                raise RecordingError(f"{self.path} holds no message on any of {', '.join(TOPICS)}; {lost}")
             undo.pop_all()
         self.topics = tuple(topic for topic in TOPICS if topic in self._counts)
         filled = [part for part in self._parts if part.places]
@@ -96,20 +93,16 @@ class RecordingReader(Closing):
     def messages(self, topics: Iterable[str] | None = None, *, start_ns: int | None = None) -> Iterator[Recorded]:
         """The messages on `topics` from `start_ns` on, in the order of their stamps, then of recording.
 
-        Chunks that end before `start_ns` are not read. A damaged chunk is skipped, and counted in `lost_bytes`.
-
-        Raises:
-            RecordingError: the file can no longer be read.
-            ValueError: a topic does not exist.
+        Chunks that end before `start_ns` are not read. A damaged chunk is skipped, and counted in `lost_bytes`. Raises
+        RecordingError if the file can no longer be read, ValueError if a topic does not exist.
         """
         wanted = set(TOPICS if topics is None else topics)
         if unknown := wanted - TOPICS.keys():
             raise ValueError(f"topics: expected of {', '.join(TOPICS)}, got {', '.join(sorted(unknown))}")
         names = wanted | {f"/{topic}" for topic in wanted}
+        parts = (part.messages(names, start_ns) for part in self._parts)
         try:
-            for log_ns, channel, data in heapq.merge(
-                *(part.messages(names, start_ns) for part in self._parts), key=lambda logged: logged.log_ns
-            ):
+            for log_ns, channel, data in heapq.merge(*parts, key=lambda logged: logged.log_ns):
                 topic = _topic(channel)
                 try:
                     yield Recorded(topic, log_ns, decode(topic, data))

@@ -31,11 +31,13 @@ from steadypose.msgs.types import Message
 CHUNK_NS = 500_000_000
 CHUNK_BYTES = 2**18
 TAIL_NS = 10_000_000_000
-"""Length of the last part's end that is searched for duplicates, nanoseconds. A killed recorder may receive again
-messages that it had written and not yet acknowledged."""
+"""Length of the last part's end that is searched for duplicates, nanoseconds.
+
+A killed recorder may receive again messages that it had written and not yet acknowledged."""
 SCAN_S = 5.0
-"""Longest time for which parts without an index are scanned when a recording goes on, seconds. On a machine that is
-switched off without notice there is one for each day; older ones count as empty in `metadata.yaml`."""
+"""Longest time for which parts without an index are scanned when a recording goes on, seconds.
+
+On a machine that is switched off without notice there is one for each day; older ones count as empty."""
 METADATA = "metadata.yaml"
 
 
@@ -72,9 +74,7 @@ class RecordingWriter(Closing):
 
         Args:
             directory: the recording's directory.
-            go_on: whether to append a part if the recording exists. Messages at the end of its last part are not
-            written
-                again.
+            go_on: append a part if the recording exists, without the messages at the end of its last part.
             split_bytes: size at which the next part starts, bytes; 0: never.
             split_ns: time span in stamps at which the next part starts, nanoseconds; 0: never.
             keep_bytes: total size above which the oldest parts are removed, bytes; 0: never.
@@ -252,8 +252,7 @@ class _Part:
             self._written[topic] = stamp_ns
             self._pending += len(payload)
             self.size += len(payload)
-            # per topic, because two topics' clocks may be unrelated; in both directions, because a clock may be set
-            # back
+            # per topic, whose clocks may be unrelated; in both directions, because a clock may be set back
             flushed = self._flushed.get(topic)
             if flushed is None or abs(stamp_ns - flushed) >= CHUNK_NS or self._pending >= CHUNK_BYTES:
                 self.flush()
@@ -304,11 +303,7 @@ class _Part:
 
 
 def recorded_parts(directory: Path) -> dict[int, Path]:
-    """The files of a recording made by steadypose, by their numbers.
-
-    Raises:
-        RecordingError: the directory contains something else.
-    """
+    """The files of steadypose's recording, by number. Raises RecordingError if the directory holds something else."""
     name = re.compile(rf"{re.escape(directory.name)}_(\d+)\.mcap")
     parts: dict[int, Path] = {}
     for path in directory.iterdir():

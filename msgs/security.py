@@ -55,12 +55,9 @@ def is_local(endpoint: str) -> bool:
 
 
 def refuse_used(path: Path) -> None:
-    """Refuse a socket path that is in use.
+    """Raise TransportError if a publisher uses a socket's path, or the path is not a socket.
 
-    ZeroMQ would silently take the path from another publisher, and would delete a file that is not a socket.
-
-    Raises:
-        TransportError: a publisher uses this path, or the path is not a socket.
+    ZeroMQ would take the path from another publisher, and delete a file that is not a socket.
     """
     try:
         kind = path.lstat().st_mode
@@ -77,11 +74,7 @@ def refuse_used(path: Path) -> None:
 
 
 def check_private(directory: Path) -> None:
-    """Check that no other user could publish in this user's name.
-
-    Raises:
-        TransportError: another user owns the directory, or others may write to it.
-    """
+    """Raise TransportError if another user owns a directory or may write to it, and so publish in this user's name."""
     try:
         status = directory.lstat()
     except FileNotFoundError:
@@ -93,22 +86,21 @@ def check_private(directory: Path) -> None:
     if not stat.S_ISDIR(status.st_mode):
         raise TransportError(f"{directory}: expected a directory for sockets, got something else")
     if status.st_uid not in (0, os.getuid()):
-        raise TransportError(
-            f"{directory} belongs to user {status.st_uid}: expected a directory of one's own for sockets; "
-            "set XDG_RUNTIME_DIR, or [transport] directory"
-        )
+        remedy = "expected a directory of one's own for sockets; set XDG_RUNTIME_DIR, or [transport] directory"
+        raise TransportError(f"{directory} belongs to user {status.st_uid}: {remedy}")
     sticky = status.st_uid == 0 and status.st_mode & stat.S_ISVTX  # /tmp, for an address chosen explicitly
-    others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
-    if status.st_mode & others and not sticky:
+    if _is_open(status) and not sticky:
         raise TransportError(f"{directory} can be written to by others: run `chmod 700 {directory}`, or choose another")
 
 
-def make_private(directory: Path) -> None:
-    """Create a directory for sockets, accessible to this user only, unless it exists.
+def _is_open(status: os.stat_result) -> bool:
+    """Whether other users may write there."""
+    others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
+    return bool(status.st_mode & others)
 
-    Raises:
-        TransportError: it exists with other owners or permissions, or cannot be created.
-    """
+
+def make_private(directory: Path) -> None:
+    """Create a directory for sockets, for this user only, unless it exists. Raises as `check_private`."""
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -117,11 +109,7 @@ def make_private(directory: Path) -> None:
 
 
 def local_directory() -> Path:
-    """The default directory of ipc sockets. It is private to the user, and removed at a reboot.
-
-    Raises:
-        TransportError: it exists, and others may write to it.
-    """
+    """The default directory of ipc sockets, private to the user, and removed at a reboot. Raises as `check_private`."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     directory = Path(runtime) / "steadypose" if runtime else Path(tempfile.gettempdir()) / f"steadypose-{os.getuid()}"
     check_private(directory)
@@ -129,10 +117,8 @@ def local_directory() -> Path:
 
 
 def local_address(node: str) -> str:
-    """The default address at which ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes.
-
-    Raises:
-        TransportError: others may write to the directory.
+    """The default address at which ``node`` (``pose_input``, ``prior``, ``trajectory``) publishes. Raises as
+    `check_private`.
     """
     return f"ipc://{local_directory() / node}"
 
@@ -161,15 +147,12 @@ class Keys:
         if host in self.servers:
             return self.servers[host]
         if self.servers and not is_local(endpoint):
-            expected = self.directory / "servers" / f"{host}.key"
-            raise TransportError(
-                f"{endpoint}: expected its public key in {expected}, found none; copy its own.key there"
-            )
+            file = self.directory / "servers" / f"{host}.key"
+            raise TransportError(f"{endpoint}: expected its public key in {file}, got none; copy its own.key there")
         return self.server
 
     def clients(self) -> set[bytes]:
-        """The public keys that may subscribe, as the directory lists them now, and `public`, for subscribers on the
-        same machine."""
+        """The public keys that may subscribe, as listed now, and `public`, for subscribers on the same machine."""
         listed = {self.public}
         for file in (self.directory / "clients").glob("*.key"):
             with suppress(TransportError, OSError):  # a file that is still being written is ignored
@@ -201,11 +184,9 @@ def _certificate(file: Path) -> tuple[bytes, bytes | None]:
 
 
 def create_keys(directory: str | Path) -> Keys:
-    """Create a pair of keys in `directory`, and an empty folder `clients`.
+    """Create a pair of keys in `directory`, and an empty folder `clients`. Raises OSError if they cannot be written.
 
-    Raises:
-        TransportError: a pair exists already. It is not replaced, because others may rely on it.
-        OSError: it cannot be written.
+    An existing pair is not replaced, because others may rely on it: then it raises TransportError.
     """
     directory = Path(directory)
     (directory / "clients").mkdir(parents=True, exist_ok=True)
@@ -227,12 +208,7 @@ def create_keys(directory: str | Path) -> Keys:
 
 
 def load_keys(directory: str | Path) -> Keys:
-    """Read a directory of keys.
-
-    Raises:
-        TransportError: a file is missing or contains no key, or others can read the secret key or write to the
-            directory.
-    """
+    """Read a directory of keys. Raises TransportError if a key is missing, invalid or open to others."""
     directory = Path(directory)
     secret_file = directory / f"{_OWN}.key_secret"
     if not secret_file.is_file():
@@ -252,26 +228,19 @@ def load_keys(directory: str | Path) -> Keys:
 
 
 def _check_folder(folder: Path) -> None:
-    """Check that no other user can change which keys are accepted.
-
-    Raises:
-        TransportError: another user owns the folder, or others may write to it.
-    """
+    """Raise TransportError if another user owns a folder of keys or may write to it, and so accept other keys."""
     status = folder.stat()
-    others = stat.S_IWOTH if status.st_gid == os.getgid() else stat.S_IWOTH | stat.S_IWGRP
     if status.st_uid not in (0, os.getuid()):
         raise TransportError(f"{folder} belongs to user {status.st_uid}: expected keys of one's own; make new ones")
-    if status.st_mode & others:
-        raise TransportError(
-            f"{folder} can be written to by others, who could add keys; run `chmod go-w {folder}`, and look into it"
-        )
+    if _is_open(status):
+        remedy = f"run `chmod go-w {folder}`, and look into it"
+        raise TransportError(f"{folder} can be written to by others, who could add keys; {remedy}")
 
 
 def loopback_keys() -> Keys:
     """This user's keys for local tcp addresses, created on first use. They last as long as the runtime directory.
 
-    Raises:
-        TransportError: the keys cannot be created, or others can read them.
+    Raises TransportError if they cannot be created, or others can read them.
     """
     directory = local_directory()
     make_private(directory)

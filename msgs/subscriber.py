@@ -30,12 +30,10 @@ DRIFT = 1e-4
 """Upper bound of the relative drift of two machines' clocks, ratio. Any crystal oscillator is better."""
 REVIVE_S = 0.5
 """Time without a reconnection attempt by ZeroMQ after which a lost connection is re-established here, seconds."""
-
 SECOND = "second publisher"
 """Cause in `Subscriber.refused` of messages whose source is bound to another publisher."""
 HANDSHAKE = "handshake"
 """Cause in `Subscriber.refused` of connections that do not come about, because keys do not fit or are missing."""
-
 _PUBLISHERS = 256
 _EVENT = struct.Struct("=HI")  # an event of ZeroMQ's monitor; zmq.utils.monitor could read it, but imports asyncio
 _HANDSHAKES = (
@@ -95,9 +93,8 @@ class Subscriber(Closing):
         """
         self._endpoints = [endpoints] if isinstance(endpoints, str) else list(endpoints)
         topics = [topics] if isinstance(topics, str) else list(topics)
-        for topic in topics:
-            if topic not in TOPICS:
-                raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {topic!r}")
+        if unknown := [topic for topic in topics if topic not in TOPICS]:
+            raise ValueError(f"topic: expected one of {', '.join(TOPICS)}, got {unknown[0]!r}")
         if conflate and (len(topics) != 1 or name):
             raise ValueError(f"conflate: expected one topic and no name, got {topics} and {name!r}")
         if reliable and not name:
@@ -131,11 +128,8 @@ class Subscriber(Closing):
         # XSUB, unlike SUB, can send acknowledgements
         self.socket = self._context.socket(zmq.XSUB if reliable else zmq.SUB)
         """socket to register in a `zmq.Poller`; read it only by `receive`"""
-        self.socket.setsockopt(zmq.CONFLATE, conflate)
-        self.socket.setsockopt(zmq.RCVHWM, high_water)
-        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_RECEIVED)
-        self.socket.setsockopt(zmq.LINGER, 0)
-        for option, value in KEEPALIVE.items():
+        limits = {zmq.RCVHWM: high_water, zmq.MAXMSGSIZE: MAX_RECEIVED, zmq.LINGER: 0}
+        for option, value in (KEEPALIVE | limits | {zmq.CONFLATE: conflate}).items():
             self.socket.setsockopt(option, value)
         self._keys, self._clear_text = keys, clear_text
         self._monitor = self.socket.get_monitor_socket(_HANDSHAKES | zmq.EVENT_DISCONNECTED | _RETRIES)
@@ -195,9 +189,9 @@ class Subscriber(Closing):
         for key, taken in news.items():
             _remember(self._taken, key, taken)
         for taken in news.values() if number else self._taken.values():
-            self._tell(taken)
+            self._send(taken)
 
-    def _tell(self, taken: Taken) -> None:
+    def _send(self, taken: Taken) -> None:
         with suppress(zmq.Again):  # a publisher that does not listen gets it again later
             self.socket.send(taken.frame(), zmq.NOBLOCK)
 
@@ -233,7 +227,7 @@ class Subscriber(Closing):
             return self._refuse("version")
         if not self._count(publisher, topic, sequence):
             if known := self._taken.get((publisher, topic)):  # the publisher resumed from an older acknowledgement
-                return self._tell(known)
+                return self._send(known)
             return self._refuse("repeated")
         late = self._age_ns(publisher, sent_ns) > self._lifespan_ns
         taken = Taken(self._listener.instance, publisher, (sequence + 1) % WRAP, topic)
@@ -264,7 +258,7 @@ class Subscriber(Closing):
                 self._untaken[index] = refused
                 return
         self._taken[refused.publisher, refused.topic] = refused
-        self._tell(refused)
+        self._send(refused)
 
     def _count(self, publisher: int, topic: str, sequence: int) -> bool:
         """Count the messages missing before `sequence`; False if it is not newer than the last one."""
@@ -337,9 +331,7 @@ def _remember(table: OrderedDict[Any, Any], key: object, value: object) -> None:
 def _check(endpoint: str, keys: Keys | None, clear_text: bool) -> None:
     transport, path = parse(endpoint)
     if keys is None and not clear_text and not is_local(endpoint):
-        raise TransportError(
-            f"{endpoint} is another machine: expected keys, got none; make them with `steadypose keys`, "
-            "or set clear_text"
-        )
+        remedy = "make them with `steadypose keys`, or set clear_text"
+        raise TransportError(f"{endpoint} is another machine: expected keys, got none; {remedy}")
     if transport == "ipc" and not path.startswith("@"):
         check_private(Path(path).absolute().parent)

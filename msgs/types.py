@@ -32,7 +32,6 @@ JOINTS = (
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
 """The canonical skeleton, `smpl22`: the SMPL body joints in SMPL's order."""
-
 CONTACTS = (
     "left_knee", "right_knee", "left_ankle", "right_ankle", "left_foot", "right_foot", "left_wrist", "right_wrist",
 )  # fmt: skip

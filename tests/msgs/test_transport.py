@@ -494,7 +494,7 @@ def test_each_publisher_may_have_a_key_of_its_own(key_directories: tuple[Path, .
     with Publisher("tcp://127.0.0.1:*", keys=load_keys(robot)) as publisher:
         with Subscriber(publisher.endpoint, POSE_RAW, keys=load_keys(guest), name="guest"):
             assert publisher.wait_for_subscribers(["guest"], timeout_s=SOON_S)
-        with pytest.raises(TransportError, match=r"servers/192\.0\.2\.7\.key, found none"):
+        with pytest.raises(TransportError, match=r"servers/192\.0\.2\.7\.key, got none"):
             Subscriber("tcp://192.0.2.7:1", POSE_RAW, keys=load_keys(guest))
 
 
