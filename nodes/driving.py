@@ -33,13 +33,10 @@ if TYPE_CHECKING:
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
 """Number of frames between checks of the input, and the time that they are assumed to take, nanoseconds."""
-
 ENOUGH = 8
 """Number of joints of a body that are certainly enough for a pose."""
-
 LYING = ("up_axis", "not_upright")
 """Causes of problems that somebody who lies or leans for a while also has."""
-
 Settings = Mapping[str, Mapping[str, Any]]
 
 
@@ -60,15 +57,11 @@ def stream(
 
 
 class Diagnosis:
-    """Checks an offline stream, whose frames are assumed to arrive at 30 Hz.
-
-    Attributes:
-        problems: the problems by cause, as first detected.
-        frames: number of frames so far.
-    """
+    """Checks an offline stream, whose frames are assumed to arrive at 30 Hz."""
 
     def __init__(self, settings: PriorSettings) -> None:
         self.problems: dict[str, Problem] = {}
+        """by cause, as first detected"""
         self._check = StreamCheck(settings)
         self._delay_frames = settings.delay
         self._first_ns: int | None = None
@@ -109,24 +102,21 @@ class Diagnosis:
         self._first_ns, self._span_ns, self._back_ns = None, 0, 0
         return new
 
-    def answer(self, asked: int, given: int) -> list[str]:
-        """Add that the output has a body in none, or in less than half, of the 30 Hz frames in which the input has one
-        (``given`` of ``asked``), unless a problem is the reason. Returns as `look`.
+    def check_output(self, frames: int, poses: int) -> list[str]:
+        """Add, unless there is a reason already, that few or none of the 30 Hz ``frames`` with a body gave ``poses``.
+
+        Returns as `look`.
         """
-        if not self.trusted or 0 < given >= asked / 2:
+        if not self.trusted or 0 < poses >= frames / 2:
             return []
         if not self._check.inhabited:
             found = error("nobody", "no frame has a body: expected joints; does the tracker detect people?")
-        elif not given:
-            found = error(
-                "nobody_recognised",
-                "no body in any frame gave a pose: expected one each; is the skeleton right, are the units metres?",
-            )
+        elif not poses:
+            expected = "expected one each; is the skeleton right, are the units metres?"
+            found = error("nobody_recognised", f"no body in any frame gave a pose: {expected}")
         else:
-            found = error(
-                "few_poses",
-                f"{given} of {asked} frames with a body gave a pose: expected nearly all; what is not used is counted",
-            )
+            got = f"{poses} of {frames} frames with a body gave a pose"
+            found = error("few_poses", f"{got}: expected nearly all; the others are counted by cause")
         return self._note([found])
 
     def _note(self, found: Iterable[Problem]) -> list[str]:
@@ -144,7 +134,6 @@ class Diagnosis:
 
     @property
     def texts(self) -> list[str]:
-        """All problems so far, one line each."""
         return list(map(str, self.problems.values()))
 
 
@@ -179,8 +168,8 @@ class OfflineRun:
         self.diagnosis = Diagnosis(prior)
         self._identifies = prior.identify.enabled
         self.poses = 0
-        self._asked: set[int] = set()
-        self._given = 0
+        self._frames_with_body: set[int] = set()
+        self._frames_with_pose = 0
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
         sensor, calibrated = NOWHERE, False
@@ -190,12 +179,12 @@ class OfflineRun:
                 self._advanced()
                 self.diagnosis.see(message)
                 if any(np.isfinite(observed(body)[:, 0]).sum() >= ENOUGH for body in message.bodies):
-                    self._asked.add(round(message.stamp_ns / FRAME_NS))
+                    self._frames_with_body.add(round(message.stamp_ns / FRAME_NS))
                 if self.diagnosis.frames % CHECKED == 0:
                     self.diagnosis.look()
             elif isinstance(message, PoseClean):
                 self.poses += len(message.bodies)
-                self._given += bool(message.bodies)
+                self._frames_with_pose += bool(message.bodies)
                 sensor, calibrated = message.sensor_pose.position, message.calibrated
             elif self._events and topic == POSE_WORLD and isinstance(message, PoseWorld):
                 self.timeline.add(message, sensor, calibrated=calibrated)
@@ -203,7 +192,7 @@ class OfflineRun:
         if not self.stamps_ns:
             raise LaunchError(f"{self._source.path}: expected frames, but none of {len(self._source)} could be read")
         self.diagnosis.end()
-        self.diagnosis.answer(len(self._asked), self._given)
+        self.diagnosis.check_output(len(self._frames_with_body), self._frames_with_pose)
 
     @property
     def refused(self) -> Counter[str]:
@@ -212,8 +201,9 @@ class OfflineRun:
         return Counter({cause: n for cause, n in counted.items() if n})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Process the whole source. Returns the arrays of `NpzCollector`, one row per input frame, and with the input's
-        axis of bodies, unless the prior assigns ids itself.
+        """Process the whole source. Returns the arrays of `NpzCollector`, one row per input frame.
+
+        They have the input's axis of bodies, unless the prior assigns ids itself.
         """
         bodies = self._source.bodies if isinstance(self._source, ArraySource) and not self._identifies else ()
         collector = NpzCollector(self, bodies)
@@ -221,9 +211,8 @@ class OfflineRun:
 
 
 def clean_joints(joints: Floats, delay: int = 8) -> Floats:
-    """Output positions (T, 22, 3) of `steadypose clean` for joints (T, 22, 3) metres, z up, at 30 Hz.
-
-    NaN where no body is recognised.
+    """Output positions (T, 22, 3) of `steadypose clean` for joints (T, 22, 3) metres, z up, at 30 Hz; NaN without a
+    body.
     """
     stamps = np.round(np.arange(len(joints)) * FRAME_NS).astype(np.int64)
     source = ArraySource(Path("joints"), {"positions": joints, "stamp_ns": stamps, "skeleton": np.array("smpl22")})

@@ -55,10 +55,8 @@ def extra_of(module: str) -> str | None:
 def how_to_install(missing: Sequence[str], extra: str) -> str:
     """The error text for missing modules of an extra."""
     size = f" ({EXTRAS[extra].size})" if EXTRAS[extra].size else ""
-    return (
-        f"needs {', '.join(missing)}, which comes with the extra {extra!r}{size} and is not installed: "
-        f"{install_command(extra)}"
-    )
+    needs = f"needs {', '.join(missing)}, which comes with the extra {extra!r}{size} and is not installed"
+    return f"{needs}: {install_command(extra)}"
 
 
 def upgrade_and_uninstall() -> str:
@@ -91,10 +89,7 @@ def _is_its_own(checkout: Path) -> bool:
 
 
 def install_command(extra: str = "") -> str:
-    """The command that installs an extra, or reinstalls steadypose, for this Python.
-
-    It names the checkout, because steadypose is not on the package index yet.
-    """
+    """The command that installs an extra, or reinstalls steadypose, for this Python, from the checkout."""
     checkout = _checkout()
     if checkout is not None and _is_its_own(checkout):
         return f"./steadypose add {extra}" if extra else "rm -f .venv/.installed-* && ./steadypose doctor"

@@ -44,7 +44,7 @@ class CompletedSource(NamedTuple):
 
     raws: list[PoseRaw]
     """the unchanged ``pose/raw``, with the end of the stream"""
-    answers: list[tuple[str, Message]]
+    outputs: list[tuple[str, Message]]
     """``pose/clean`` and ``pose/world`` with their topics, in order"""
     completion: Completion
     refused: dict[str, int]
@@ -56,13 +56,13 @@ class CompletedSource(NamedTuple):
 
     def messages(self) -> list[tuple[str, Message]]:
         """All messages, ordered by stamp."""
-        every = [*((POSE_RAW, message) for message in self.raws), *self.answers]
+        every = [*((POSE_RAW, message) for message in self.raws), *self.outputs]
         return sorted(every, key=lambda pair: pair[1].stamp_ns)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, one row for each frame of the grid that has a body."""
         stamps_ns = np.array([message.stamp_ns for message in self.completion.clean[:-1]], np.int64)
-        return NpzCollector(self.answers, self.bodies).arrays(stamps_ns)
+        return NpzCollector(self.outputs, self.bodies).arrays(stamps_ns)
 
 
 def load_completer(weights: str) -> tuple[PartsCompleter, Uncertainty]:
@@ -78,37 +78,35 @@ def complete_source(
     uncertainty: Uncertainty,
     advanced: Callable[[int, int], None] = lambda frames, total: None,
 ) -> CompletedSource:
-    """Complete a source. The other arguments are those of `complete_raws`.
+    """Complete a source; the other arguments are those of `complete_raws`.
 
-    Raises:
-        LaunchError: no frame could be read.
-        CompletionError: as in `complete_raws`.
+    Raises LaunchError if no frame could be read, CompletionError as `complete_raws`.
     """
     raws = [message for _, message in with_end(frames) if isinstance(message, PoseRaw)]
     if not raws:
         raise LaunchError(f"{frames.path}: expected frames, but none of {len(frames)} could be read")
     completion = complete_raws(str(frames.path), raws[:-1], fill, uncertainty, advanced)
-    answers, counters = _answered(completion)
+    outputs, counters = _outputs(completion)
     refused = {cause: n for cause, n in (frames.refused + counters).items() if n}
     bodies = frames.bodies if isinstance(frames, ArraySource) else ()
     problems = [text for text in _problems(raws) if not text.startswith("root_relative")]  # `complete` is for those too
-    return CompletedSource(raws, answers, completion, refused, problems, bodies)
+    return CompletedSource(raws, outputs, completion, refused, problems, bodies)
 
 
 def alternative_of(completed: CompletedSource, uncertainty: Uncertainty, seed: int) -> CompletedSource:
     """Draw another completion of the same source with a random seed."""
     completion = alternative(completed.completion, completed.raws[:-1], uncertainty, seed)
-    return completed._replace(completion=completion, answers=_answered(completion)[0])
+    return completed._replace(completion=completion, outputs=_outputs(completion)[0])
 
 
-def _answered(completion: Completion) -> tuple[list[tuple[str, Message]], Counter[str]]:
-    """Return a completion's ``pose/clean`` and ``pose/world`` with their topics, and what the latter refused."""
+def _outputs(completion: Completion) -> tuple[list[tuple[str, Message]], Counter[str]]:
+    """A completion's ``pose/clean`` and ``pose/world`` with their topics, and what the latter refused."""
     settings = TrajectorySettings()
-    world, answers = TrajectoryPipeline(settings), list[tuple[str, Message]]()
+    pipeline, outputs = TrajectoryPipeline(settings), list[tuple[str, Message]]()
     for message, moved in zip(completion.clean, along_paths(completion, settings.weights), strict=True):
-        answers.append((POSE_CLEAN, message))
-        answers += [(POSE_WORLD, answer) for answer in world.process(moved)]
-    return answers, world.counters
+        outputs.append((POSE_CLEAN, message))
+        outputs += [(POSE_WORLD, world) for world in pipeline.process(moved)]
+    return outputs, pipeline.counters
 
 
 def _problems(raws: Sequence[PoseRaw]) -> list[str]:
@@ -176,10 +174,8 @@ def fit_source(
     messages = list(stream(frames, make_prior({"delay": delay}), make_trajectory({})))
     fits = fit_stream(messages, surface, model, folder, began, advanced)
     if not fits:
-        raise LaunchError(
-            f"{frames.path}: expected somebody who is seen for {MIN_FRAMES} frames or more, found nobody; is the "
-            "skeleton right, are the units metres? `steadypose info` says what it holds"
-        )
+        expected = f"expected somebody for {MIN_FRAMES} frames or more, got nobody"
+        raise LaunchError(f"{frames.path}: {expected}; are skeleton and units right? See `steadypose info`")
     raws = [message for _, message in messages if isinstance(message, PoseRaw)]
     stamps = np.array([raw.stamp_ns for raw in raws if not raw.end_of_stream], np.int64)
     bodies = frames.bodies if isinstance(frames, ArraySource) else ()
@@ -197,8 +193,6 @@ def with_bones(arrays: dict[str, NDArray[Any]], track: FittedTrack) -> dict[str,
 def _surface(frames: RecordedSource, points: NDArray[Any]) -> Floats:
     """(T, N, 3) metres, without points at an impossible distance from the camera."""
     if points.dtype.kind not in "fiu" or points.ndim != 3 or len(points) != len(frames) or points.shape[-1] != 3:
-        raise NpzError(
-            f"{frames.path}: points: expected ({len(frames)}, N, 3) metres, NaN for what is missing, got "
-            f"{points.dtype} {points.shape}"
-        )
+        got = f"{points.dtype} {points.shape}"
+        raise NpzError(f"{frames.path}: points: expected ({len(frames)}, N, 3) metres, NaN if missing, got {got}")
     return in_sight(points.astype(np.float64))

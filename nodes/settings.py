@@ -32,8 +32,9 @@ def launch_errors() -> Iterator[None]:
 
 
 def path_setting(bundled: str = "") -> Any:
-    """A field for a path. A relative path in a launch file is relative to that file. Files of the package's folder
-    ``bundled`` can be given by name alone, see `located`.
+    """A field for a path. A relative path in a launch file is relative to that file.
+
+    Files of the package's folder ``bundled`` can be given by name alone, see `located`.
     """
     return field(default="", metadata={_PATH: bundled})
 
@@ -73,11 +74,7 @@ def _is_path(setting: Field[Any], value: str) -> bool:
 
 
 def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -> None:
-    """Check a host and a port. With ``least`` 0, port 0 is allowed and means any free port.
-
-    Raises:
-        LaunchError: the host is empty, or the port is out of range.
-    """
+    """Raise LaunchError if a host is empty, or a port out of range. With ``least`` 0, port 0 means any free port."""
     if not host:
         raise LaunchError(f"[{section}] host: expected an address, such as 127.0.0.1, got none")
     if not least <= port <= 65535:
@@ -85,24 +82,19 @@ def check_host_and_port(section: str, host: str, port: int, *, least: int = 1) -
 
 
 def load_plugin(setting: str, reference: Any) -> Any:
-    """Import the object that a launch file names as ``module:name``.
-
-    Raises:
-        LaunchError: the reference is malformed, or cannot be imported.
-    """
+    """Import what a launch file names as ``module:name``. Raises LaunchError if it cannot be imported."""
     module, separator, name = reference.partition(":") if isinstance(reference, str) else ("", "", "")
     if not (module and separator and name):
         raise LaunchError(f"{setting}: expected module:name, got {reference!r}")
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise LaunchError(
-            f"{setting}: {reference} cannot be imported: {error}; install its package beside steadypose"
-        ) from error
+        remedy = "install its package beside steadypose"
+        raise LaunchError(f"{setting}: {reference} cannot be imported: {error}; {remedy}") from error
 
 
 def as_text(name: str) -> str:
-    """A file's name for messages and pictures: escapes stand for bytes that are not UTF-8, which these cannot hold."""
+    """A file's name for messages and images: escapes stand for bytes that are not UTF-8, which these cannot hold."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 

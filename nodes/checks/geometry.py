@@ -52,11 +52,8 @@ def check_geometry(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     if not np.isfinite(joints).any():
         if any(np.isfinite(body.positions).any() for body in bodies(messages)):
             return  # all of confidence 0: see `layout`
-        yield error(
-            "all_missing",
-            f"all joints of the last {len(joints)} bodies are NaN: expected metres. Where nobody is, send no body; in "
-            "an array, NaN says the same, and this can be ignored",
-        )
+        remedy = "where nobody is, send no body; in an array, NaN says the same, and this can be ignored"
+        yield error("all_missing", f"all joints of the last {len(joints)} bodies are NaN: expected metres; {remedy}")
         return
     if (problem := _degenerate(messages, joints) or _zeros(skeleton, joints)) is not None:
         yield problem
@@ -92,12 +89,9 @@ def check_jumps(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     joints = tracks(messages, paths[0][1].shape[1])
     height = float(np.nanmax(np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1)))
     if (fast := float(np.nanmedian(found))) > FASTEST * height > 0:
-        yield warning(
-            "jumps",
-            f"a body moves at {fast:.0f} units per second, {fast / height:.0f} times its height: expected less than "
-            f"{FASTEST:.0f}; if ids switch between people, --set prior.identify.enabled=true; if stamps are times of "
-            "arrival, use times of capture",
-        )
+        moves = f"a body moves at {fast:.0f} units per second, {fast / height:.0f} times its height"
+        remedy = "if ids switch between people, --set prior.identify.enabled=true; otherwise use stamps of capture"
+        yield warning("jumps", f"{moves}: expected less than {FASTEST:.0f}; {remedy}")
 
 
 def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
@@ -115,11 +109,9 @@ def check_speed(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
     whole, limb = float(np.nanmedian(moved)), float(np.nanmax(np.nanmedian(swung, axis=0)))
     if whole > RUNNER_M_S or limb > LIMB_M_S:
         what = f"a body moves at {whole:.0f} m/s" if whole > RUNNER_M_S else f"a limb swings at {limb:.0f} m/s"
-        yield warning(
-            "too_fast",
-            f"{what} for a second, which no person does, with frames {interval / 1e6:.3g} ms apart: expected times of "
-            "capture; set fps to the rate at which the recording was made, such as 30, or give stamps of capture",
-        )
+        apart = f"frames {interval / 1e6:.3g} ms apart"
+        remedy = "set fps to that of the recording, such as 30, or give stamps of capture"
+        yield warning("too_fast", f"{what} for a second, with {apart}: expected times of capture; {remedy}")
 
 
 def _paths(messages: Sequence[PoseRaw]) -> list[tuple[NDArray[np.int64], Floats]]:
@@ -142,28 +134,22 @@ def _degenerate(messages: Sequence[PoseRaw], joints: Floats) -> Problem | None:
         return None
     flat = np.nanmax(several, axis=1) == np.nanmin(several, axis=1)
     if 2 * (points := flat.all(axis=1)).sum() >= len(several):
-        return error(
-            "one_point",
-            f"all joints of a body are at one point, {np.nanmax(several[points][-1], axis=0).round(3).tolist()}, in "
-            f"{points.sum()} of the last {len(several)} bodies: expected metres, and NaN of a joint that was not seen",
-        )
+        where = f"at one point, {np.nanmax(several[points][-1], axis=0).round(3).tolist()}"
+        share = f"in {points.sum()} of the last {len(several)} bodies"
+        expected = "expected metres, and NaN for a joint that was not observed"
+        return error("one_point", f"all joints of a body are {where}, {share}: {expected}")
     if flat.all(axis=0).any():
         axis = "xyz"[int(np.argmax(flat.all(axis=0)))]
-        return error(
-            "flat",
-            f"{axis} is the same for all joints, as in 2D key points without depth: expected three coordinates in "
-            "metres; if you have a depth image, from_coco lifts key points to 3D (docs/sources.md)",
-        )
+        flat_as = f"{axis} is the same for all joints, as in 2D key points without depth"
+        remedy = "if you have a depth image, from_coco lifts key points to 3D (docs/sources.md)"
+        return error("flat", f"{flat_as}: expected three coordinates in metres; {remedy}")
     stamps = {raw.stamp_ns for raw in messages if raw.bodies}
     if len(stamps) >= ENOUGH and len(joints) >= len(messages):
         first, *others = (raw.bodies[0].positions for raw in messages if raw.bodies)
         if all(np.array_equal(first, other, equal_nan=True) for other in others):
-            return error(
-                "frozen",
-                f"the joints are identical to the last bit in {len(messages)} messages with {len(stamps)} "
-                "different stamps: the tracker repeats its last answer; expected new joints with each stamp, or no "
-                "message",
-            )
+            same = f"the joints are identical in {len(messages)} messages with {len(stamps)} different stamps"
+            expected = "expected new joints with each stamp, or no message"
+            return error("frozen", f"{same}: the tracker repeats its last output; {expected}")
     return None
 
 
@@ -175,45 +161,33 @@ def _zeros(skeleton: Skeleton, joints: Floats) -> Problem | None:
     if not zero.any():
         return None
     worst = int(zero.sum(axis=0).argmax())
-    return error(
-        "zeros",
-        f"joints lie exactly at the origin, {skeleton.joints[worst]} in {zero[:, worst].sum()} of the last "
-        f"{len(joints)} bodies: expected NaN, or confidence 0, for a joint that was not found",
-    )
+    share = f"{skeleton.joints[worst]} in {zero[:, worst].sum()} of the last {len(joints)} bodies"
+    expected = "expected NaN, or confidence 0, for a joint that was not observed"
+    return error("zeros", f"joints lie exactly at the origin, {share}: {expected}")
 
 
 def _no_body(skeleton: Skeleton, like: Likeness, joints: Floats) -> Problem:
     others = [other for other in likenesses(joints) if other.skeleton != skeleton.name]
-    off = f"{like.worst} is {like.ratio:.1f} times as long as in a body"
-    if others and others[0].is_body:
-        return error(
-            "wrong_order",
-            f"in the order of {skeleton.name} these joints do not form a body ({off}), but in that of "
-            f"{others[0].skeleton} they do: expected skeleton {others[0].skeleton!r}",
-        )
+    worst = f"{like.worst} is {like.ratio:.1f} times as long as in a body"
+    wrong = f"in the order of {skeleton.name} these joints do not form a body ({worst})"
+    if others and (best := others[0]).is_body:
+        name = best.skeleton
+        return error("wrong_order", f"{wrong}, but in that of {name} they do: expected skeleton {name!r}")
     tried = ", ".join(other.skeleton for other in others)
-    return error(
-        "wrong_order",
-        f"in the order of {skeleton.name} these joints do not form a body "
-        f"({off}){f', nor in that of {tried}' if tried else ''}: expected {', '.join(skeleton.joints[:4])}, …, as in "
-        "prior/body/layouts.toml; reorder yours, or describe your layout (docs/sources.md)",
-    )
+    expected = f"expected {', '.join(skeleton.joints[:4])}, …, as in prior/body/layouts.toml"
+    remedy = "reorder yours, or describe your layout (docs/sources.md)"
+    return error("wrong_order", f"{wrong}{f', nor in that of {tried}' if tried else ''}: {expected}; {remedy}")
 
 
 def _unit(like: Likeness) -> Problem:
     height = like.scale * ADULT_M
     for unit, factor in UNITS.items():
         if SIZES[0] < like.scale / factor < SIZES[1]:
-            return error(
-                "unit",
-                f"the body is {float(f'{height:.3g}'):g} m tall: these seem to be {unit}, expected metres; "
-                + (f"divide by {factor:g}" if factor > 1 else f"multiply by {1 / factor:g}"),
-            )
-    return error(
-        "unit",
-        f"the body is {height:.3g} m tall: expected metres, not image coordinates (pixels or normalised); use the "
-        "tracker's world coordinates",
-    )
+            tall = f"the body is {float(f'{height:.3g}'):g} m tall"
+            remedy = f"divide by {factor:g}" if factor > 1 else f"multiply by {1 / factor:g}"
+            return error("unit", f"{tall}: these seem to be {unit}, expected metres; {remedy}")
+    expected = "expected metres, not image coordinates (pixels or normalised)"
+    return error("unit", f"the body is {height:.3g} m tall: {expected}; use the tracker's world coordinates")
 
 
 def _far(joints: Floats) -> Iterator[Problem]:
@@ -221,13 +195,11 @@ def _far(joints: Floats) -> Iterator[Problem]:
     away = medians(np.abs(joints).max(axis=-1), axis=1)
     far = away[np.isfinite(away)] > MAX_DISTANCE
     if far.sum() >= ENOUGH:
-        found = error(
-            "too_far",
-            f"joints are {np.nanmax(away):.0f} m from the sensor: expected at most {MAX_DISTANCE:.0f} m, and farther "
-            "ones are not used; if these are world coordinates, give sensor_pose and joints relative to it, or "
-            "subtract an origin near the people",
-        )
-        yield found if far.all() else replace(found, level=Level.WARN)
+        got = f"joints are {np.nanmax(away):.0f} m from the sensor"
+        remedy = "subtract an origin near the people, or give sensor_pose, and joints relative to it"
+        expected = f"expected at most {MAX_DISTANCE:.0f} m, and farther ones are not used"
+        problem = error("too_far", f"{got}: {expected}; {remedy}")
+        yield problem if far.all() else replace(problem, level=Level.WARN)
 
 
 def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
@@ -238,47 +210,35 @@ def _frame(pose: Pose, stand: Stance) -> Iterator[Problem]:
         if mirrored:
             yield error(
                 "mirrored",
-                "bodies are mirrored: given their left and right, toes, noses and knees point backwards; expected a "
-                "right-handed frame and the person's own left: negate x, or undo an exchange of two axes, or of left "
-                "and right (a mirrored image)",
+                "bodies are mirrored, toes, noses and knees point backwards: expected a right-handed frame and the "
+                "person's own left; negate x, or undo an exchange of two axes, or of left and right (a mirrored image)",
             )
         return
     axis = int(np.argmax(np.abs(stand.up)))
     if abs(stand.up[axis]) < ALONG:
-        yield warning(
-            "not_upright",
-            f"bodies lean by {np.degrees(np.arccos(np.clip(up[2], -1, 1))):.0f} degrees, along no axis of their frame: "
-            "expected sensor_pose.orientation to turn their frame to z up; calibrate the sensor, or give the direction "
-            "of gravity (docs/calibrate.md)",
-        )
+        angle = np.degrees(np.arccos(np.clip(up[2], -1, 1)))
+        lean = f"bodies lean by {angle:.0f} degrees, along no axis of their frame"
+        expected = "expected sensor_pose.orientation to turn their frame to z up"
+        remedy = "calibrate the sensor, or give the direction of gravity (docs/calibrate.md)"
+        yield warning("not_upright", f"{lean}: {expected}; {remedy}")
         return
     name = ("-" if stand.up[axis] < 0 else "") + "xyz"[axis]
     x, _, _, w = pose.orientation
+    stands = f"stand along {name} of their frame"
     if abs(abs(x) - 1.0) < 0.01 and abs(w) < 0.01 and name == "z":
-        yield error(
-            "quaternion_order",
-            "sensor_pose.orientation is 1 0 0 0, which turns bodies upside down; it seems to be the identity as wxyz: "
-            "expected xyzw, 0 0 0 1",
-        )
+        got = "sensor_pose.orientation is 1 0 0 0, which turns bodies upside down"
+        yield error("quaternion_order", f"{got}: it seems to be the identity as wxyz; expected xyzw, 0 0 0 1")
     elif mirrored and name in ("y", "-y"):
-        yield error(
-            "axes_exchanged",
-            f"bodies stand along {name} of their frame and are mirrored: y and z are exchanged; expected x, y, z of a "
-            "right-handed frame: exchange them back",
-        )
+        expected = "expected x, y, z of a right-handed frame; exchange y and z back"
+        yield error("axes_exchanged", f"bodies {stands} and are mirrored: {expected}")
     elif mirrored:
-        yield error(
-            "axis_sign",
-            f"bodies stand along {name} of their frame and are mirrored: that axis has the wrong sign, or was "
-            "exchanged with z; expected a right-handed frame with z up",
-        )
+        expected = "expected a right-handed frame with z up; change that axis' sign, or exchange it with z"
+        yield error("axis_sign", f"bodies {stands} and are mirrored: {expected}")
     else:
-        wanted = f"up {name!r}: Pose.from_up({name!r}), or up = {name!r} in the file"
-        yield warning(
-            "up_axis",
-            f"bodies lie down in the world: they stand along {name} of their frame; unless people do lie, expected "
-            + (wanted if name in ("z", "y", "-y") else "sensor_pose.orientation to turn that axis to the world's z"),
-        )
+        known = f"up {name!r}: Pose.from_up({name!r}), or up = {name!r} in the file"
+        other = "sensor_pose.orientation to turn that axis to the world's z"
+        expected = f"unless people do lie, expected {known if name in ('z', 'y', '-y') else other}"
+        yield warning("up_axis", f"bodies lie down in the world: they {stands}; {expected}")
 
 
 def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem]:
@@ -287,19 +247,14 @@ def _place(raw: PoseRaw, skeleton: Skeleton, joints: Floats) -> Iterator[Problem
     if at_origin(canonical):
         yield warning(
             "root_relative",
-            "the pelvis is at the origin in every frame, so that nobody moves: the joints seem to be relative to the "
-            "root; expected positions relative to the sensor: add the root's place, or have `steadypose complete` "
-            "predict it",
+            "the pelvis is at the origin in every frame, so that nobody moves: expected positions relative to the "
+            "sensor; add the root's place, or have `steadypose complete` predict it",
         )
     elif raw.calibrated:
         world = SensorFrame.of(raw.sensor_pose).to_world(canonical)
         legs = world[:, [J[f"{side}_{joint}"] for side in ("left", "right") for joint in ("ankle", "foot")], 2]
-        if (
-            np.isfinite(legs).any()
-            and not FLOOR_M[0] < (lowest := float(np.nanmedian(np.nanmin(legs, axis=1)))) < FLOOR_M[1]
-        ):
-            yield warning(
-                "floor",
-                f"the sensor is marked as calibrated, but feet are at a height of {lowest:.2f} m: expected "
-                "the floor at 0; calibrate again (docs/calibrate.md), or set calibrated=False",
-            )
+        lowest = float(np.nanmedian(np.nanmin(legs, axis=1))) if np.isfinite(legs).any() else 0.0
+        if not FLOOR_M[0] < lowest < FLOOR_M[1]:
+            got = f"the sensor is marked as calibrated, but feet are at a height of {lowest:.2f} m"
+            remedy = "calibrate again (docs/calibrate.md), or set calibrated=False"
+            yield warning("floor", f"{got}: expected the floor at 0; {remedy}")

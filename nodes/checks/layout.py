@@ -62,12 +62,9 @@ def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterat
 def _unknown(messages: Sequence[PoseRaw], count: int) -> Problem:
     name = messages[-1].skeleton
     like = _best(messages, count)
-    hint = f"; its {count} joints are most like {like!r}" if like else ""
-    return error(
-        "unknown_skeleton",
-        f"skeleton {name!r}{_named_like(name)}{hint}: expected one of {', '.join(SKELETONS)}; for a layout of your "
-        "own, see docs/sources.md",
-    )
+    hint = f"{_named_like(name)}; its {count} joints are most like {like!r}" if like else _named_like(name)
+    expected = f"expected one of {', '.join(SKELETONS)}; for a layout of your own, see docs/sources.md"
+    return error("unknown_skeleton", f"skeleton {name!r}{hint}: {expected}")
 
 
 def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) -> Problem:
@@ -78,9 +75,8 @@ def _wrong_count(messages: Sequence[PoseRaw], skeleton: Skeleton, count: int) ->
         hint = f"; {' and '.join(same)} have {count}"
     else:
         hint = "; a joint that was not detected is NaN, not left out"
-    return error(
-        "wrong_joint_count", f"{skeleton.name}: expected bodies of {len(skeleton.joints)} joints, got {count}{hint}"
-    )
+    expected = f"expected bodies of {len(skeleton.joints)} joints"
+    return error("wrong_joint_count", f"{skeleton.name}: {expected}, got {count}{hint}")
 
 
 def _best(messages: Sequence[PoseRaw], count: int) -> str | None:
@@ -96,20 +92,16 @@ def check_sensor_pose(pose: Pose) -> Iterator[Problem]:
     """The problem of a sensor pose that cannot be used."""
     norm = float(np.linalg.norm(pose.orientation))
     if not np.isfinite(pose.position).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
-        yield error(
-            "sensor_pose",
-            f"sensor_pose is not a valid pose: position {np.round(pose.position, 3).tolist()}, orientation "
-            f"{np.round(pose.orientation, 3).tolist()} of norm {norm:.3g}; expected finite numbers and a unit "
-            "quaternion xyzw: Pose.from_up('-y') for a level camera, 0 0 0 1 if z is up",
-        )
-        return
-    if not (farthest := float(np.abs(pose.position).max())) < MAX_PLACE:
-        yield error(
-            "sensor_pose",
-            f"sensor_pose.position is {farthest:.0f} m from the world's origin along an axis: expected less than "
-            f"{MAX_PLACE:.0f}, or rounding would move joints by millimetres; subtract an origin near the people, or "
-            "use a frame such as odom",
-        )
+        place, turn = np.round(pose.position, 3).tolist(), np.round(pose.orientation, 3).tolist()
+        got = f"sensor_pose is not a valid pose: position {place}, orientation {turn} of norm {norm:.3g}"
+        expected = "expected finite numbers and a unit quaternion xyzw"
+        remedy = "Pose.from_up('-y') for a level camera, 0 0 0 1 if z is up"
+        yield error("sensor_pose", f"{got}; {expected}: {remedy}")
+    elif not (farthest := float(np.abs(pose.position).max())) < MAX_PLACE:
+        got = f"sensor_pose.position is {farthest:.0f} m from the world's origin along an axis"
+        expected = f"expected less than {MAX_PLACE:.0f}, or rounding would move joints by millimetres"
+        remedy = "subtract an origin near the people, or use a frame such as odom"
+        yield error("sensor_pose", f"{got}: {expected}; {remedy}")
 
 
 def _confidence(messages: Sequence[PoseRaw], needed: float) -> Iterator[Problem]:
@@ -119,33 +111,22 @@ def _confidence(messages: Sequence[PoseRaw], needed: float) -> Iterator[Problem]
     values = np.concatenate(found)
     seen = np.concatenate([np.isfinite(body.positions).all(axis=1) for body in bodies(messages)])
     if not np.isfinite(values).any():
-        yield error(
-            "confidence_nan",
-            "confidence is NaN for every joint: expected 0 to 1; 1 where the source has no confidences",
-        )
+        yield error("confidence_nan", "confidence is NaN for every joint: expected 0 to 1; 1 if the source has none")
         return
     most, least = float(np.nanmax(values)), float(np.nanmin(values))
     if most > 1.0:
         top = 100 if most <= 100 else 255 if most <= 255 else None
-        yield warning(
-            "confidence_range",
-            f"confidence goes up to {most:g}: expected 0 to 1; above 1 counts as 1; "
-            + (f"divide by {top}" if top and most > 1.5 else "scale or clip it"),
-        )
+        remedy = f"divide by {top}" if top and most > 1.5 else "scale or clip it"
+        yield warning("confidence_range", f"confidence goes up to {most:g}: expected 0 to 1; {remedy}")
     elif least < 0.0:
         yield warning("confidence_range", f"confidence goes down to {least:g}: expected 0 to 1; below 0 counts as 0")
     elif seen.any() and not (np.nan_to_num(values[seen]) > 0).any():
-        yield warning(
-            "confidence_zero",
-            "confidence is 0 for every joint that has a position: expected 0 to 1; give 1 if the source has no "
-            "confidences, and NaN positions for joints that it did not see",
-        )
+        remedy = "give 1 if the source has none, and NaN positions for joints that it did not observe"
+        yield warning("confidence_zero", f"confidence is 0 for every joint with a position: expected 0 to 1; {remedy}")
     elif seen.any() and most < needed:
-        yield warning(
-            "confidence_low",
-            f"confidence is {most:.2g} at most: expected 0 to 1, as a joint below {needed:g} counts as not seen; scale "
-            "it, or lower [prior.gate] min_confidence",
-        )
+        expected = f"expected 0 to 1, as a joint below {needed:g} counts as not observed"
+        remedy = "scale it, or lower [prior.gate] min_confidence"
+        yield warning("confidence_low", f"confidence is {most:.2g} at most: {expected}; {remedy}")
 
 
 def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
@@ -153,46 +134,38 @@ def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
 
     seen = [int(np.isfinite(body.positions).all(axis=1).sum()) for body in bodies(messages)]
     if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
-        yield warning(
-            "few_joints",
-            f"only {usual} of a body's joints are seen, the others are NaN: expected {MIN_JOINTS} or more; get the "
-            "whole body into the image, or lower the tracker's own threshold",
-        )
+        remedy = "get the whole body into the image, or lower the tracker's own threshold"
+        got = f"only {usual} of a body's joints are observed"
+        yield warning("few_joints", f"{got}, the others are NaN: expected {MIN_JOINTS} or more; {remedy}")
 
 
 def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iterator[Problem]:
     most = max(len(raw.bodies) for raw in messages)
     if most > max_bodies:
-        yield warning(
-            "too_many_bodies",
-            f"{most} bodies in a message: expected at most {max_bodies} ([prior] max_bodies); raise the limit with "
-            f"--set prior.max_bodies={most}, or send fewer",
-        )
+        remedy = f"send fewer, or --set prior.max_bodies={most}"
+        yield warning("too_many_bodies", f"{most} bodies in a message: expected at most {max_bodies}; {remedy}")
     twice = sum(len({body.id for body in raw.bodies}) < len(raw.bodies) for raw in messages)
     if identified:
         return
     if twice > len(messages) / 2:
-        yield error(
-            "ids_repeated",
-            f"bodies of one message share an id in {twice} of {len(messages)} messages: expected one id per person; "
-            "number them, or let steadypose assign ids: --set prior.identify.enabled=true",
-        )
+        got = f"bodies of one message share an id in {twice} of {len(messages)} messages"
+        remedy = "number them, or let steadypose assign ids: --set prior.identify.enabled=true"
+        yield error("ids_repeated", f"{got}: expected one id per person; {remedy}")
         return
     appearances = Counter(body.id for body in bodies(messages))
     inhabited = sum(bool(raw.bodies) for raw in messages)
     always = inhabited >= 2 * ENOUGH and np.median(list(appearances.values())) <= 2 and len(appearances) > 2 * most
     if always or _handovers(messages) >= HANDOVERS:
-        problem = error(
-            "ids_change",
-            f"{len(appearances)} ids in {inhabited} messages of at most {most} bodies: expected a person to keep the "
-            "id; where the tracker does not, --set prior.identify.enabled=true",
-        )
+        got = f"{len(appearances)} ids in {inhabited} messages of at most {most} bodies"
+        remedy = "where the tracker does not, --set prior.identify.enabled=true"
+        problem = error("ids_change", f"{got}: expected a person to keep the id; {remedy}")
         yield problem if always else replace(problem, level=Level.WARN)
 
 
 def _handovers(messages: Sequence[PoseRaw]) -> int:
-    """Number of messages in which a new id is where another id was in the message before, and no longer is. People who
-    walk in and out do not take each other's places from one message to the next.
+    """Number of messages in which a new id has the place of another in the message before, which is gone.
+
+    People who walk in and out do not take each other's places from one message to the next.
     """
     found = 0
     for before, after in pairwise(messages):
@@ -223,11 +196,8 @@ def count_hint(shape: Sequence[int]) -> str:
 
 def skeleton_hint(name: str, shape: Sequence[int]) -> str:
     """A hint for an unknown skeleton name."""
-    return (
-        _named_like(name)
-        or count_hint(shape)
-        or "; for joints of your own, give their layout (docs/library.md, docs/sources.md)"
-    )
+    own = "; for joints of your own, give their layout (docs/library.md, docs/sources.md)"
+    return _named_like(name) or count_hint(shape) or own
 
 
 def _named_like(name: str) -> str:
@@ -241,9 +211,8 @@ def axes_hint(shape: Sequence[int], skeleton: str) -> str:
     if len(shape) == 2 and shape == (joints, 3):
         return "; for a single frame: positions[None], or steadypose.Filter for frame by frame"
     if len(shape) == 2 and shape[-1] in (3 * joints, 2 * joints, 4 * joints):
-        return (
-            f"; a row of numbers a frame: positions.reshape(len(positions), {joints}, {shape[-1] // joints})[..., :3]"
-        )
+        shaped = f"positions.reshape(len(positions), {joints}, {shape[-1] // joints})[..., :3]"
+        return f"; a row of numbers a frame: {shaped}"
     if len(shape) == 3 and shape[1:] == (3, joints):
         return "; the last two axes are exchanged: positions.transpose(0, 2, 1)"
     if len(shape) == 3 and shape[0] == joints and shape[2] == 3:

@@ -82,26 +82,14 @@ def observed(body: RawBody) -> NDArray[np.float64]:
 def check_wire(refused: Mapping[str, Counter[str]]) -> Iterator[Problem]:
     """Problems with the frames that subscribers have just refused: their numbers by address, then by cause."""
     if second := [f"{counts[SECOND]} from {at}" for at, counts in refused.items() if counts[SECOND]]:
-        yield error(
-            "second_publisher",
-            f"messages of a second publisher with the same source name were refused ({', '.join(second)}): "
-            "expected one publisher per source; give each sensor its own name (`source` of its messages), or stop "
-            "one of the two",
-        )
+        refusal = f"messages of a second publisher with the same source name were refused ({', '.join(second)})"
+        remedy = "give each sensor its own name (`source` of its messages), or stop one of the two"
+        yield error("second_publisher", f"{refusal}: expected one publisher per source; {remedy}")
     if shut_out := [at for at, counts in refused.items() if counts[HANDSHAKE]]:
-        yield error(
-            "keys",
-            f"no connection to {', '.join(shut_out)}: expected CurveZMQ keys that this side and that one know of each "
-            "other, or none on either side (docs/subscribe.md#from-another-machine)",
-        )
-    if invalid := [
-        f"{cause}: {n} from {at}"
-        for at, counts in refused.items()
-        for cause, n in sorted(counts.items())
-        if cause not in (SECOND, HANDSHAKE)
-    ]:
-        yield error(
-            "not_a_message",
-            f"frames are no valid messages ({', '.join(invalid)}): expected the topic, a zero byte, a header of 17 "
-            "bytes, and CDR (docs/other_languages.md)",
-        )
+        expected = "expected CurveZMQ keys that both sides know of each other, or none on either side"
+        where = "docs/subscribe.md#from-another-machine"
+        yield error("keys", f"no connection to {', '.join(shut_out)}: {expected} ({where})")
+    causes = [(cause, n, at) for at, counts in refused.items() for cause, n in sorted(counts.items())]
+    if invalid := [f"{cause}: {n} from {at}" for cause, n, at in causes if cause not in (SECOND, HANDSHAKE)]:
+        expected = "expected the topic, a zero byte, a header of 17 bytes, and CDR (docs/other_languages.md)"
+        yield error("not_a_message", f"frames are no valid messages ({', '.join(invalid)}): {expected}")

@@ -25,8 +25,7 @@ AHEAD_NS = 300_000_000
 UNSORTED = 2 / 3
 """Share of stamps older than an earlier one from which no useful output is possible, ratio."""
 STEP_NS = 500_000_000
-"""Change of the offset between stamps and clock, from one message to the next, that shows that a clock was set,
-nanoseconds."""
+"""Change of the offset between stamps and clock, between two messages, that shows that a clock was set, ns."""
 SECONDS_BELOW = 10**11
 """Upper bound of stamps that may be seconds since 1970, seconds; valid until the year 5138."""
 SETTLED = 8
@@ -34,8 +33,7 @@ SETTLED = 8
 
 
 def check_stamps(stamps: NDArray[np.int64], arrived: NDArray[np.int64] | None) -> Iterator[Problem]:
-    """Problems with the stamps (T,) of a window, nanoseconds. Those of a live stream should also be close to the wall
-    times (T,) at which they ``arrived``; None for another."""
+    """Problems with the stamps (T,) of a window, ns. ``arrived`` (T,) are wall times, of a live stream only."""
     if len(stamps) < ENOUGH:
         return
     if (problem := _unit(stamps)) is not None:
@@ -43,37 +41,27 @@ def check_stamps(stamps: NDArray[np.int64], arrived: NDArray[np.int64] | None) -
         return
     steps = np.diff(stamps)
     if (steps < 0).sum() > max(1, 0.1 * len(steps)):
-        found = warning(
-            "stamps_out_of_order",
-            f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before: expected "
-            "increasing stamps; publish frames in the order of their capture, from one thread; in a file sort the rows "
-            "by stamp",
-        )
+        got = f"{(steps < 0).sum()} of the last {len(steps)} stamps are older than the one before"
+        remedy = "publish frames in the order of their capture, from one thread; sort a file's rows by stamp"
+        problem = warning("stamps_out_of_order", f"{got}: expected increasing stamps; {remedy}")
         # of two threads' frames every other one is late; of an unsorted file's nearly all, and these are not used
         if (stamps < np.maximum.accumulate(stamps)).mean() > UNSORTED:
-            yield replace(found, level=Level.ERROR)
+            yield replace(problem, level=Level.ERROR)
             return
-        yield found
+        yield problem
     elif (steps == 0).sum() > 0.3 * len(steps):
-        yield warning(
-            "stamps_repeated",
-            f"{(steps == 0).sum()} of the last {len(steps)} stamps repeat the one before: expected one message per "
-            "frame; put all bodies of a frame into one message",
-        )
+        got = f"{(steps == 0).sum()} of the last {len(steps)} stamps repeat the one before"
+        expected = "expected one message per frame; put all bodies of a frame into one message"
+        yield warning("stamps_repeated", f"{got}: {expected}")
     rate = SECOND_NS / max(float(np.median(steps)), 1.0)
     if (longer := _stretched(rate)) is not None:
         unit, factor = longer
-        yield error(
-            "stamps_unit",
-            f"stamps are {1 / rate:.3g} s apart: they seem to be {unit}, converted as if they were seconds; expected "
-            f"times of capture: divide by {factor:.0f}",
-        )
+        wrong = f"stamps are {1 / rate:.3g} s apart: they seem to be {unit}, converted as if they were seconds"
+        yield error("stamps_unit", f"{wrong}; expected times of capture: divide by {factor:.0f}")
     elif 0 < rate < SLOW_HZ:
-        yield warning(
-            "slow",
-            f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second: expected {SLOW_HZ:.0f} or more, "
-            "ideally 30; fast motion is lost: use a smaller network or smaller images",
-        )
+        got = f"stamps are {1e3 / rate:.0f} ms apart, {rate:.1f} frames a second"
+        remedy = "fast motion is lost: use a smaller network or smaller images"
+        yield warning("slow", f"{got}: expected {SLOW_HZ:.0f} or more, ideally 30; {remedy}")
     if arrived is not None:
         yield from _against_clock(arrived - stamps)
 
@@ -83,9 +71,9 @@ def check_back(back_ns: int) -> Iterator[Problem]:
     if back_ns > STEP_NS:
         yield warning(
             "stamps_back",
-            f"stamps go back by {back_ns / SECOND_NS:.1f} s, so the stream starts anew there, and where the times "
-            "before and after overlap, the poses of both are mixed: expected increasing stamps; sort a file's rows by "
-            "stamp, or, if the clock was set, cut the recording there and clean its parts one by one",
+            f"stamps go back by {back_ns / SECOND_NS:.1f} s, so the stream starts anew, and poses of both streams mix "
+            "where their times overlap: expected increasing stamps; sort a file's rows by stamp or, if the clock was "
+            "set, cut the recording there and clean its parts one by one",
         )
 
 
@@ -94,9 +82,8 @@ def check_length(span_ns: int, delay_frames: int) -> Iterator[Problem]:
     if span_ns < (delay_frames - 0.5) * SECOND_NS / FPS:  # stamps are rounded
         yield warning(
             "short",
-            f"the stream lasts {span_ns / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames: "
-            "standard deviations are too small, because the sensor's error in depth is not estimated yet; expected a "
-            "longer stream, or a shorter delay",
+            f"the stream lasts {span_ns / SECOND_NS:.2f} s, less than the delay of {delay_frames} frames, so that "
+            "standard deviations are too small: expected a longer stream, or a shorter delay",
         )
 
 
@@ -104,28 +91,20 @@ def _unit(stamps: NDArray[np.int64]) -> Problem | None:
     """The problem with stamps that are not nanoseconds."""
     newest, rising = int(stamps[-1]), np.diff(stamps)
     if not stamps.any():
-        return error(
-            "stamps_zero",
-            "stamp is 0 in every message: expected nanoseconds of capture; set stamp_ns to time.time_ns() when the "
-            "image is taken",
-        )
+        remedy = "set stamp_ns to time.time_ns() when the image is taken"
+        return error("stamps_zero", f"stamp is 0 in every message: expected nanoseconds of capture; {remedy}")
     step = float(np.median(rising[rising > 0])) if (rising > 0).any() else 0.0
     if not step and (rising < 0).any():
         return None  # they decrease
     if not (stamps % SECOND_NS).any() and (step == 0 or (step >= SECOND_NS and not _stretched(SECOND_NS / step))):
-        return error(
-            "stamps_whole_seconds",
-            f"stamps are whole seconds, the last {newest // SECOND_NS} s: expected nanoseconds of capture; in ROS use "
-            "both stamp.sec and stamp.nanosec, in a CSV decimals (0.033), otherwise time.time_ns()",
-        )
+        got = f"stamps are whole seconds, the last {newest // SECOND_NS} s"
+        remedy = "in ROS use stamp.sec and stamp.nanosec, in a CSV decimals (0.033), otherwise time.time_ns()"
+        return error("stamps_whole_seconds", f"{got}: expected nanoseconds of capture; {remedy}")
     if not step and newest < SECONDS_BELOW:
         return _of_unit("seconds", f"stamp is {newest} in every message", UNITS["seconds"])
     if not step:
-        return error(
-            "stamps_constant",
-            f"stamp is {newest} in every message: expected nanoseconds of capture, another for each frame; "
-            "use time.time_ns()",
-        )
+        expected = "expected nanoseconds of capture, another for each frame; use time.time_ns()"
+        return error("stamps_constant", f"stamp is {newest} in every message: {expected}")
     if SECOND_NS / step > RATES_HZ[1]:
         for unit, factor in UNITS.items():
             # whole seconds increase by one only now and then; finer units increase with every frame
@@ -142,28 +121,21 @@ def _stretched(rate: float) -> tuple[str, float] | None:
     return None
 
 
-def _of_unit(unit: str, found: str, factor: float) -> Problem:
-    return error(
-        "stamps_unit",
-        f"{found}: they seem to be {unit}, expected nanoseconds of capture; multiply by {factor:.0f}, or use "
-        "time.time_ns() when the image is taken",
-    )
+def _of_unit(unit: str, got: str, factor: float) -> Problem:
+    remedy = f"multiply by {factor:.0f}, or use time.time_ns() when the image is taken"
+    return error("stamps_unit", f"{got}: they seem to be {unit}, expected nanoseconds of capture; {remedy}")
 
 
 def _against_clock(late: NDArray[np.int64]) -> Iterator[Problem]:
     """Problems with the offset between this machine's clock and the stamps, nanoseconds."""
     if -late.max() > AHEAD_NS:
-        yield warning(
-            "stamps_ahead",
-            f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock: expected times of capture "
-            "in the past; synchronise the two clocks (NTP or PTP)",
-        )
+        got = f"stamps are {-late.max() / SECOND_NS:.1f} s ahead of this machine's clock"
+        expected = "expected times of capture in the past; synchronise the two clocks (NTP or PTP)"
+        yield warning("stamps_ahead", f"{got}: {expected}")
     # delayed messages arrive late and then catch up; after a clock was set, the offset stays
     step = int(np.argmax(np.abs(np.diff(late)))) + 1
     before, after = late[:step], late[step:]
     if min(len(before), len(after)) >= SETTLED and abs(moved := int(after.min() - before.min())) > STEP_NS:
-        yield warning(
-            "clock_jumped",
-            f"the source's clock jumped by {abs(moved) / SECOND_NS:.1f} s relative to this machine's, so the stream "
-            "restarts: expected a steady clock; let NTP slew that clock instead of setting it",
-        )
+        got = f"the source's clock jumped by {abs(moved) / SECOND_NS:.1f} s relative to this machine's"
+        expected = "expected a steady clock; let NTP slew that clock instead of setting it"
+        yield warning("clock_jumped", f"{got}, so the stream restarts: {expected}")

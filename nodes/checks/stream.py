@@ -25,7 +25,7 @@ CHECKS = 3
 """Number of successive checks with nearly all poses flagged that make a problem. The flag reports shorter faults."""
 
 
-class Answers:
+class OutputCheck:
     """Counts the pipeline's input and output between two checks, beside the pipeline's own counters."""
 
     def __init__(self, counters: Counter[str], *, identified: bool) -> None:
@@ -35,11 +35,11 @@ class Answers:
         self._flagged_checks = 0
         self._forget()
 
-    def asked(self, raw: PoseRaw) -> None:
+    def add_input(self, raw: PoseRaw) -> None:
         self._joints += sum(int(np.isfinite(body.positions[:, 0]).sum()) for body in raw.bodies)
         self._in += len(raw.bodies)
 
-    def given(self, clean: PoseClean) -> None:
+    def add_output(self, clean: PoseClean) -> None:
         self._out += len(clean.bodies)
         self._flagged += sum(body.anomaly_flag for body in clean.bodies)
 
@@ -49,23 +49,15 @@ class Answers:
         refused, self._refused_before = refused_ever - self._refused_before, refused_ever
         found = []
         if self._in >= ENOUGH and refused > MAX_SHARE * self._joints:
-            found.append(
-                warning(
-                    "nearly_all_refused",
-                    f"{100 * refused / self._joints:.0f} % of the joints seen were refused as jumps: expected a few; "
-                    f"{self._if_ids_switch}if stamps are times of arrival, use times of capture",
-                )
-            )
+            share = f"{100 * refused / self._joints:.0f} % of the observed joints were refused as jumps"
+            remedy = f"{self._if_ids_switch}if stamps are times of arrival, use times of capture"
+            found.append(warning("nearly_all_refused", f"{share}: expected a few; {remedy}"))
         nearly_all = self._out >= ENOUGH and self._flagged > MAX_SHARE * self._out
         self._flagged_checks = self._flagged_checks + 1 if nearly_all else 0
         if self._flagged_checks >= CHECKS:
-            found.append(
-                warning(
-                    "nearly_all_flagged",
-                    f"{self._flagged} of the last {self._out} poses were flagged as unlike human motion: expected a "
-                    "few in a thousand; check left and right, axes and joint order in the 3D view (--view)",
-                )
-            )
+            share = f"{self._flagged} of the last {self._out} poses were flagged as unlike human motion"
+            remedy = "check left and right, axes and joint order in the 3D view (--view)"
+            found.append(warning("nearly_all_flagged", f"{share}: expected a few in a thousand; {remedy}"))
         self._forget()
         return found
 
@@ -90,10 +82,8 @@ NOBODY = 60
 class StreamCheck:
     """Checks a stream of ``pose/raw`` for misuse, for a prior of these settings.
 
-    Attributes:
-        received: number of messages so far.
-        inhabited: number of messages with at least one body so far.
-        examined_ns: wall time of the last examination, nanoseconds; -1: never.
+    ``received`` and ``inhabited`` are the numbers of messages so far, and of those with a body; ``examined_ns`` is the
+    wall time of the last examination, nanoseconds, -1 before the first.
     """
 
     def __init__(self, settings: PriorSettings) -> None:
@@ -118,8 +108,9 @@ class StreamCheck:
         self._heard_ns = at_ns
 
     def problems(self, now_ns: int, *, live: bool, anew: bool = True) -> list[Problem]:
-        """The stream's current problems at wall time ``now_ns``; if ``live``, it should go on in real time. The
-        messages are examined only if ``anew``; otherwise the last result is returned.
+        """The stream's current problems at wall time ``now_ns``; if ``live``, it should go on in real time.
+
+        The messages are examined only if ``anew``; otherwise the last result is returned.
         """
         if not self._arrivals or self._ended:
             return []
@@ -127,11 +118,8 @@ class StreamCheck:
             self._heard_ns = now_ns  # this machine's clock was set: silence counts from now
         self._asked_ns = now_ns
         if live and (silent_ns := now_ns - self._heard_ns) > SILENT_NS:
-            text = (
-                f"no message for {silent_ns / 1e9:.0f} s, after message {self.received}: the tracker has "
-                "stopped, hangs, or lost its connection; restart it, and the stream continues"
-            )
-            return [error("stopped", text)]
+            silence = f"no message for {silent_ns / 1e9:.0f} s, after message {self.received}"
+            return [error("stopped", f"{silence}: the tracker has stopped, hangs, or lost its connection; restart it")]
         if anew:
             self.examined_ns = now_ns
             with warnings.catch_warnings():  # numpy warns of joints that are always NaN, which the checks expect
@@ -155,8 +143,8 @@ class StreamCheck:
         if not self.inhabited and self.received >= NOBODY:
             yield warning(
                 "nobody",
-                f"{self.received} messages, none with a body: expected bodies; if people are in view, the "
-                "tracker does not detect them, or the publisher leaves `bodies` empty",
+                f"{self.received} messages, none with a body: expected bodies; does the tracker detect people, and "
+                "the publisher fill `bodies`?",
             )
         if not _usable(names):  # with a wrong layout, checks of joints mean nothing
             return
@@ -184,11 +172,9 @@ class StreamChecks:
 
     @property
     def seen(self) -> bool:
-        """Whether any message has arrived so far."""
         return bool(self._checks)
 
     def see(self, raw: PoseRaw, at_ns: int) -> None:
-        """Record a message that arrived at wall time ``at_ns``."""
         source = raw.source if self._streams > 1 else ""
         check = self._checks.pop(source, None) or StreamCheck(self._settings)
         self._checks[source] = check
@@ -197,7 +183,6 @@ class StreamChecks:
         check.see(raw, at_ns)
 
     def heard(self, source: str, at_ns: int) -> None:
-        """Record that a message of a source arrived and was dropped unread."""
         if check := self._checks.get(source if self._streams > 1 else ""):
             check.heard(at_ns)
 

@@ -95,10 +95,8 @@ def sections(settings: Settings | None, delay: int) -> Settings:
         if name not in PIPELINES or not isinstance(part, Mapping):
             hint = nearest(str(name).partition(".")[0], PIPELINES)
             got = f"{name} = {part!r}" if name in PIPELINES else f"{name!r}{hint}"
-            raise LaunchError(
-                f"settings: expected sections {', '.join(map(repr, PIPELINES))}, each with its settings, such as "
-                f"{{'prior': {{'delay': 2}}}}; got {got}"
-            )
+            expected = f"sections {', '.join(map(repr, PIPELINES))}, such as {{'prior': {{'delay': 2}}}}"
+            raise LaunchError(f"settings: expected {expected}; got {got}")
     found = {name: dict(given.get(name, {})) for name in PIPELINES}
     found["prior"] = {"delay": delay} | found["prior"]
     check_settings(found)
@@ -172,15 +170,12 @@ def as_array(name: str, value: ArrayLike) -> NDArray[Any]:
             value = np.ma.filled(value.astype(np.float64), np.nan)  # as a bool, NaN would be True
         array = np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise NpzError(
-            f"{name}: expected numbers of one shape, got {type(value).__name__} ({error}); frames without a "
-            "joint or a body have NaN there, not fewer entries"
-        ) from error
+        remedy = "frames without a joint or a body have NaN there, not fewer entries"
+        got = f"{type(value).__name__} ({error})"
+        raise NpzError(f"{name}: expected numbers of one shape, got {got}; {remedy}") from error
     if array.dtype.kind == "O":
-        raise NpzError(
-            f"{name}: expected numbers, got {type(value).__name__} of objects; what is missing is float('nan'), not "
-            "None, in arrays of one shape"
-        )
+        remedy = "what is missing is float('nan'), not None, in arrays of one shape"
+        raise NpzError(f"{name}: expected numbers, got {type(value).__name__} of objects; {remedy}")
     return array
 
 
@@ -251,11 +246,8 @@ def complete(
     Args:
         positions: as in `clean`. Joints that are NaN are missing, and so are frames between stamps more than 1/20 s
             apart.
-        fps: as in `clean`.
-        stamp_ns: as in `clean`.
-        skeleton: as in `clean`.
         confidence: as in `clean`. Joints with confidence 0 are missing.
-        up: as in `clean`.
+        fps, stamp_ns, skeleton, up: as in `clean`.
         weights: weight set of the completer: 'default', or a .safetensors file.
         seed: draw an alternative instead of the expected motion, another with each seed (0 or more): what is missing
             differs from the expected motion by about ``sigma``.
@@ -298,12 +290,7 @@ def fit(
     """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes a second or more per second of one body.
 
     Args:
-        positions: as in `clean`.
-        fps: as in `clean`.
-        stamp_ns: as in `clean`.
-        skeleton: as in `clean`.
-        confidence: as in `clean`.
-        up: as in `clean`.
+        positions, fps, stamp_ns, skeleton, confidence, up: as in `clean`.
         points: (T, N, 3) metres, points on the body's surface from a depth camera, in the same frame; padded with NaN.
         weights: weight set of the transition model: 'default', or a .safetensors file.
         delay: delay of `clean`, which initialises the fit, frames at 30 Hz.
@@ -352,10 +339,8 @@ def plot(
         ModuleNotFoundError: matplotlib is not installed (extra 'view').
     """
     if not isinstance(poses, Mapping | str | os.PathLike):
-        raise NpzError(
-            f"expected what steadypose.clean, complete or fit gave, or the path of a recording, got "
-            f"{type(poses).__name__}; steadypose.plot(steadypose.clean(joints, fps=30))"
-        )
+        expected = "expected what steadypose.clean, complete or fit gave, or the path of a recording"
+        raise NpzError(f"{expected}, got {type(poses).__name__}; steadypose.plot(steadypose.clean(joints, fps=30))")
     history = history_of_arrays(poses) if isinstance(poses, Mapping) else history_of_path(Path(str(poses)))
     figure = draw(history, body)
     if output is not None:

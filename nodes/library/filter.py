@@ -21,15 +21,7 @@ from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.graph.prior_node import make_prior
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.graph.trajectory_node import make_trajectory
-from steadypose.nodes.library.arrays import (
-    SkeletonLike,
-    as_array,
-    logger,
-    sections,
-    skeleton_name,
-    suggesting,
-    warn,
-)
+from steadypose.nodes.library.arrays import SkeletonLike, as_array, logger, sections, skeleton_name, suggesting, warn
 from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import STAMPS_END_NS
@@ -150,10 +142,8 @@ class Filter:
         stamp = _stamp(t, stamp_ns)
         bodies, self._several = self._bodies(joints, confidence, ids)
         if sensor_pose is None and self._last is not None and self._last.sensor_pose is not self._pose:
-            raise FilterError(
-                "sensor_pose: expected one with every frame, as with the last, got none; if the camera stands still, "
-                "give it to Filter alone"
-            )
+            expected = "expected one with every frame, as with the last, got none"
+            raise FilterError(f"sensor_pose: {expected}; if the camera stands still, give it to Filter alone")
         pose, calibrated = sensor_pose or self._pose, self._calibrated or sensor_pose is not None
         raw = PoseRaw(stamp, "sensor", "program", self._skeleton, pose, calibrated, bodies)
         self._diagnosis.see(raw)
@@ -171,7 +161,7 @@ class Filter:
             return []
         end = replace(self._last, bodies=[], end_of_stream=True)
         poses, self._last = self._poses(self._prior.process(end)), None
-        warn(self._diagnosis.end() + self._diagnosis.answer(0, self._recognised))
+        warn(self._diagnosis.end() + self._diagnosis.check_output(0, self._recognised))
         return poses
 
     @property
@@ -194,8 +184,8 @@ class Filter:
                 of_call += events
             if clean.bodies:
                 self._recognised = True
-                answers: list[tuple[str, Message]] = [(POSE_CLEAN, clean), *((POSE_WORLD, world) for world in worlds)]
-                poses.append(Poses(self._arrays(NpzCollector(answers).newest), self.problems, events=events))
+                outputs: list[tuple[str, Message]] = [(POSE_CLEAN, clean), *((POSE_WORLD, world) for world in worlds)]
+                poses.append(Poses(self._arrays(NpzCollector(outputs).newest), self.problems, events=events))
         self.events = tuple(of_call)
         return poses
 
@@ -219,28 +209,23 @@ class Filter:
             return [], several or self._several
         if positions.dtype.kind not in "fiu" or positions.shape[-2:] != wanted or positions.ndim not in (2, 3):
             hint = axes_hint((1, *positions.shape[-2:]), self._skeleton) if positions.ndim > 1 else ""
-            raise FilterError(
-                f"joints: expected ({wanted[0]}, 3) metres, or (bodies, {wanted[0]}, 3), for {self._skeleton}, got "
-                f"{positions.dtype} of shape {positions.shape}{hint}"
-            )
+            expected = f"({wanted[0]}, 3) metres, or (bodies, {wanted[0]}, 3), for {self._skeleton}"
+            got = f"{positions.dtype} of shape {positions.shape}{hint}"
+            raise FilterError(f"joints: expected {expected}, got {got}")
         positions = positions.reshape(-1, *wanted)
         if len(positions) > MAX_BODIES:
-            raise FilterError(
-                f"joints: expected {MAX_BODIES} bodies of one moment at most, got {len(positions)}; frames go one by "
-                "one, and a whole recording into steadypose.clean"
-            )
+            got = f"got {len(positions)}; frames go one by one, and a whole recording into steadypose.clean"
+            raise FilterError(f"joints: expected {MAX_BODIES} bodies of one moment at most, {got}")
         sure = np.isfinite(positions).all(axis=-1) if confidence is None else as_array("confidence", confidence)
         if sure.dtype.kind not in "fiub" or sure.size != positions.shape[0] * wanted[0]:
-            raise FilterError(
-                f"confidence: expected {positions.shape[:-1]} numbers of 0 to 1, got {sure.dtype} of shape {sure.shape}"
-            )
+            got = f"{sure.dtype} of shape {sure.shape}"
+            raise FilterError(f"confidence: expected {positions.shape[:-1]} numbers of 0 to 1, got {got}")
         sure = np.asarray(sure, np.float32).reshape(positions.shape[:-1])
         numbers = list(range(len(positions)) if ids is None else ids if isinstance(ids, Iterable) else ())
         fit = all(isinstance(id, Integral) and -(2**31) <= id < 2**31 for id in numbers)
         if not fit or not len(set(numbers)) == len(numbers) == len(positions):
-            raise FilterError(
-                f"ids: expected a list of {len(positions)} different integers of 32 bits, one a body, got {ids!r}"
-            )
+            expected = f"a list of {len(positions)} different integers of 32 bits, one a body"
+            raise FilterError(f"ids: expected {expected}, got {ids!r}")
         bodies = [RawBody(int(id), *parts) for id, *parts in zip(numbers, positions, sure, strict=True)]
         return [body for body in bodies if not (several and np.isnan(body.positions).all())], several
 
@@ -253,19 +238,14 @@ def _check_pose(pose: object) -> None:
 
 
 def _stamp(t: float | None, stamp_ns: int | None) -> int:
-    """Nanoseconds of capture."""
     if (t is None) == (stamp_ns is None):
-        got = "neither" if t is None else "both"
-        raise FilterError(
-            f"expected the time of capture, as t in seconds or as stamp_ns, got {got}: cleaner(joints, time.time())"
-        )
+        got = f"{'neither' if t is None else 'both'}: cleaner(joints, time.time())"
+        raise FilterError(f"expected the time of capture, as t in seconds or as stamp_ns, got {got}")
     if stamp_ns is not None:
         number = isinstance(stamp_ns, Real) and not isinstance(stamp_ns, np.timedelta64)
         if not number or not 0 <= stamp_ns < STAMPS_END_NS or stamp_ns != round(stamp_ns):
-            raise FilterError(
-                f"stamp_ns: expected whole nanoseconds of 0 or more and under {STAMPS_END_NS}, got {stamp_ns!r}; "
-                "seconds are t"
-            )
+            expected = f"whole nanoseconds of 0 or more and under {STAMPS_END_NS}"
+            raise FilterError(f"stamp_ns: expected {expected}, got {stamp_ns!r}; seconds are t")
         return int(stamp_ns)
     if isinstance(t, timedelta | np.timedelta64):
         raise FilterError(f"t: expected a number of seconds, got {t!r}; t / np.timedelta64(1, 's')")

@@ -154,10 +154,8 @@ class Poses(dict[str, NDArray[Any]]):
 
     @property
     def contacts(self) -> ByName:
-        """(8,) probability that a joint of `CONTACTS` (knees, ankles, feet, wrists) bears load, by joint.
-
-        NaN, unknown, for a foot, ankle and toes, that was not observed for the last 2 s or never, and for its knee if
-        that was not either.
+        """(8,) probability that a joint of `CONTACTS` (knees, ankles, feet, wrists) bears load, by joint; NaN if
+        unknown.
         """
         return self._by_name("contacts")
 
@@ -237,9 +235,8 @@ class Poses(dict[str, NDArray[Any]]):
 
         def __getattr__(self, name: str) -> Any:
             if name == "events":
-                raise AttributeError(
-                    "no events: expected poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
-                )
+                expected = "poses of steadypose.clean(...), or of steadypose.Filter(..., events=True)"
+                raise AttributeError(f"no events: expected {expected}")
             raise AttributeError(f"Poses has no attribute {name!r}{nearest(name, dir(self))}")
 
         def __missing__(self, name: str) -> Any:
@@ -265,9 +262,8 @@ def _installed(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != name:
             raise
-        raise ModuleNotFoundError(
-            f"to_{name} needs {name}, which is not installed: pip install {name}", name=name
-        ) from error
+        text = f"to_{name} needs {name}, which is not installed: pip install {name}"
+        raise ModuleNotFoundError(text, name=name) from error
 
 
 BUNDLED = "walk_turn"

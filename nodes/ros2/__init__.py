@@ -17,16 +17,10 @@ if TYPE_CHECKING:
 
 
 def check_ros() -> None:
-    """Check that ROS 2's topics can be reached.
-
-    Raises:
-        LaunchError: there is neither a sourced ROS 2 nor Cyclone DDS.
-    """
+    """Raise LaunchError if there is neither a sourced ROS 2 nor Cyclone DDS."""
     if not has_sourced_ros() and find_spec("cyclonedds") is None:
-        raise LaunchError(
-            f"ROS 2: needs Cyclone DDS, which comes with the extra 'ros2' (x86-64): {install_command('ros2')}; "
-            "or a ROS 2 that is sourced, with a Python of the same version"
-        )
+        needs = f"ROS 2: needs Cyclone DDS, which comes with the extra 'ros2' (x86-64): {install_command('ros2')}"
+        raise LaunchError(f"{needs}; or a ROS 2 that is sourced, with a Python of the same version")
 
 
 def has_sourced_ros() -> bool:
@@ -37,12 +31,8 @@ def has_sourced_ros() -> bool:
 def connect(name: str, namespace: str = "") -> Connection:
     """Join the ROS domain, through rclpy if a ROS is sourced, otherwise over plain DDS.
 
-    Args:
-        name: the node's name; visible only with rclpy.
-        namespace: the node's namespace. Topics are given by their full names.
-
-    Raises:
-        LaunchError: there is neither a usable rclpy nor Cyclone DDS.
+    ``name`` and ``namespace`` are the node's, visible only with rclpy; topics are given by their full names. Raises
+    LaunchError if there is neither a usable rclpy nor Cyclone DDS.
     """
     check_ros()
     if has_sourced_ros():

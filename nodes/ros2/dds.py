@@ -45,11 +45,9 @@ class DdsConnection:
     """A participant in the ROS domain given by ``ROS_DOMAIN_ID``; implements `Connection`."""
 
     def __init__(self) -> None:
-        domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-        if (
-            os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") == "LOCALHOST"
-            or os.environ.get("ROS_LOCALHOST_ONLY", "0") == "1"
-        ):
+        variable = os.environ.get
+        domain = int(variable("ROS_DOMAIN_ID") or 0)
+        if variable("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST" or variable("ROS_LOCALHOST_ONLY") == "1":
             _stay_here(domain)
         self._participant = DomainParticipant(domain)
         self._writers: dict[Publish, DataWriter] = {}

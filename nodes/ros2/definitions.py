@@ -55,11 +55,7 @@ def serialise(message: Any) -> bytes:
 
 
 def deserialise(cdr: bytes, name: str) -> Any:
-    """Decode a message of a type from CDR.
-
-    Raises:
-        rosbags.serde.SerdeError: the bytes are not a message of this type.
-    """
+    """Decode a message of a type from CDR. Raises rosbags' SerdeError if the bytes are not one."""
     return ros_types().deserialize_cdr(cdr, name)
 
 
@@ -91,15 +87,9 @@ class Connection(Protocol):
     """A node in a ROS domain. Not thread-safe."""
 
     def publisher(self, topic: str, kind: str, *, latched: bool = False) -> Publish:
-        """Create a reliable publisher.
+        """Create a reliable publisher on a topic such as ``tf`` of a type such as ``tf2_msgs/msg/TFMessage``.
 
-        Args:
-            topic: its name, such as ``tf``, without a leading slash.
-            kind: its type, such as ``tf2_msgs/msg/TFMessage``.
-            latched: whether late subscribers receive the last message (TRANSIENT_LOCAL).
-
-        Raises:
-            LaunchError: the type is not available.
+        If ``latched``, late subscribers receive the last message. Raises LaunchError if the type is not available.
         """
         ...
 

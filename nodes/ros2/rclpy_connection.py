@@ -74,9 +74,6 @@ def _compiled(kind: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), name)
     except ImportError as error:
-        how = (
-            "build it with colcon: docs/ros2.md"
-            if package == "steadypose_msgs"
-            else f"sudo apt install ros-$ROS_DISTRO-{package.replace('_', '-')}"
-        )
+        how = f"sudo apt install ros-$ROS_DISTRO-{package.replace('_', '-')}"
+        how = "build it with colcon: docs/ros2.md" if package == "steadypose_msgs" else how
         raise LaunchError(f"{kind} is not available in the sourced ROS: {how}") from error

@@ -114,7 +114,7 @@ REFUSED: dict[str, tuple[Callable[[np.ndarray], Any], str]] = {
     "a quaternion of another length": (lambda j: Filter(sensor_pose=TWICE), "of norm 2; .* and a unit quaternion xyzw"),
     "one of a frame": (lambda j: Filter()(j[0], 0.0, sensor_pose=NO_TURN), "of norm 0; .* and a unit quaternion xyzw"),
     "a place for a pose": (lambda j: Filter(sensor_pose=(0.0, 0.0, 1.4)), r"sensor_pose: expected steadypose\.Pose"),
-    "a number for a section": (lambda j: clean(j, fps=30, settings={"prior": 2}), "settings, such .*; got prior = 2"),
+    "a number for a section": (lambda j: clean(j, fps=30, settings={"prior": 2}), "such .*; got prior = 2"),
     "an event's threshold that there is not": (
         lambda j: clean(j, fps=30, settings={"events": {"neer": 2.0}}),
         r"\[events\] has no setting 'neer' \(did you mean 'near'",
@@ -156,7 +156,7 @@ ANSWERED = {
     "plot in.txt": "in.txt: expected a rosbag2 directory, an .mcap",
     "clean hip.csv /proc/out.npz": "expected a folder that can be written to",
     "clean in.csv out.json": "expected .npz or .csv for arrays, or a name without ending for a recording",
-    "clean in.csv out.vrma": "`steadypose export` makes a .bvh, .glb, .vrma or .trc of an .npz",
+    "clean in.csv out.vrma": "`steadypose export` makes .bvh, .glb, .vrma and .trc",
     "clean in.csv out.npz --skeletons own.toml": "left_wrist: expected names of joints, got ['HandL']",
     "clean in.csv out.npz --skeletons mine.toml": "mine.toml: expected sections [skeletons.NAME] with joints, got none",
     "export in.csv out.bvh": "clean it first: steadypose clean in.csv in.npz",
@@ -305,7 +305,7 @@ def test_a_recording_most_of_whose_frames_give_no_pose_is_not_trusted(joints: np
 def test_a_misspelt_array_is_named(tmp_path: Path, joints: np.ndarray, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "in.npz", joints=joints, fps=30)
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 2
-    assert "it has joints, fps; needed are positions" in capsys.readouterr().err
+    assert "got joints, fps; needed are positions" in capsys.readouterr().err
     np.savez(tmp_path / "up.npz", positions=joints, skeleton="smpl22", fps=30, upp="-y", scores=np.zeros(5))
     assert main(["clean", str(tmp_path / "up.npz"), str(tmp_path / "out.npz")]) == 2
     assert "expected an array 'up', or none of a similar name; it has 'upp'" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Diagnostics, Level, Pose, PoseClean, PoseRaw, RawBody
 from steadypose.nodes.checks.geometry import check_geometry
 from steadypose.nodes.checks.problem import from_values
-from steadypose.nodes.checks.stream import Answers, StreamCheck
+from steadypose.nodes.checks.stream import OutputCheck, StreamCheck
 from steadypose.nodes.graph.clock import Timeline
 from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.prior_node import PriorNode
@@ -138,7 +138,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "microseconds for nanoseconds": (stamp(lambda ns, _: ns // 10**3), "stamps_unit", "multiply by 1000"),
     "a Kinect's ticks for nanoseconds": (stamp(lambda ns, _: ns // 100), "stamps_unit", "ticks of 100 ns"),
     "two threads": (stamp(lambda ns, k: ns + 50_000_000 * (k % 2)), "stamps_out_of_order", "order of their capture"),
-    "rows that are not sorted": (ROWS_SHUFFLED, "stamps_out_of_order", "sort the rows by stamp"),
+    "rows that are not sorted": (ROWS_SHUFFLED, "stamps_out_of_order", "rows by stamp"),
     "whole milliseconds as seconds": (MILLISECONDS, "stamps_unit", "seem to be milliseconds, converted as if they"),
     "a message a body": (stamp(lambda ns, k: ns - k % 2 * 33_333_333), "stamps_repeated", "into one message"),
     "a clock that is ahead": (stamp(lambda ns, _: ns + 5 * SECOND_NS), "stamps_ahead", "NTP or PTP"),
@@ -149,8 +149,8 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "y up, and z said": (axes(1, 2, 0), "up_axis", "Pose.from_up('y')"),
     "an optical frame, and z said": (OPTICAL, "up_axis", "Pose.from_up('-y')"),
     "x up": (axes(2, 0, 1), "up_axis", "turn that axis to the world's z"),
-    "y and z exchanged": (axes(0, 2, 1), "axes_exchanged", "exchange them back"),
-    "z of the wrong sign": (scaled(1, 1, -1), "axis_sign", "wrong sign"),
+    "y and z exchanged": (axes(0, 2, 1), "axes_exchanged", "exchange y and z back"),
+    "z of the wrong sign": (scaled(1, 1, -1), "axis_sign", "that axis' sign"),
     "x mirrored": (scaled(-1, 1, 1), "mirrored", "negate x"),
     "x and y exchanged": (axes(1, 0, 2), "mirrored", "exchange of two axes"),
     "a selfie picture: left is right": (SELFIE, "mirrored", "left and right"),
@@ -163,25 +163,29 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "key points of an image, z 0": (scaled(1, 0, 1), "flat", "from_coco"),
     "coordinates of a map": (joints(lambda it: it + [35, 0, 0]), "too_far", "subtract an origin"),
     "joints relative to the root": (joints(lambda it: it - it[0]), "root_relative", "add the root's place"),
-    "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN of a joint"),
+    "all joints at the origin": (joints(np.zeros_like), "one_point", "NaN for a joint"),
     "all joints at the pelvis, or missing": (AT_PELVIS_OR_NOWHERE, "one_point", "in 20 of the last 20 bodies"),
     "all joints missing": (joints(lambda it: np.full_like(it, np.nan)), "all_missing", "send no body"),
     "zeros for a joint that is not found": (WRIST_ZERO, "zeros", "NaN, or confidence 0"),
     "hardly a joint seen": (FOUR_SEEN, "few_joints", "the tracker's own threshold"),
-    "a tracker that repeats itself": (body(lambda it, _: walk(0.1)[0].bodies[0]), "frozen", "repeats its last answer"),
+    "a tracker that repeats itself": (body(lambda it, _: walk(0.1)[0].bodies[0]), "frozen", "repeats its last output"),
     "confidences of zero": (confidence(np.zeros_like), "confidence_zero", "give 1"),
-    "confidences near zero": (confidence(lambda it: it * 0.05), "confidence_low", "below 0.1 counts as not seen"),
+    "confidences near zero": (confidence(lambda it: it * 0.05), "confidence_low", "below 0.1 counts as not observed"),
     "confidences to a hundred": (confidence(lambda it: it * 100), "confidence_range", "divide by 100"),
     "confidences to 255": (confidence(lambda it: it * 255), "confidence_range", "divide by 255"),
     "confidences below zero": (confidence(lambda it: it - 2), "confidence_range", "below 0 counts as 0"),
-    "confidences of NaN": (confidence(lambda it: it * np.nan), "confidence_nan", "1 where the source has no"),
+    "confidences of NaN": (confidence(lambda it: it * np.nan), "confidence_nan", "1 if the source has none"),
     "an id for five frames": (ID_FOR_FIVE, "ids_change", "prior.identify.enabled=true"),
     "an id a frame": (ID_A_FRAME, "ids_change", "prior.identify.enabled=true"),
     "all ids the same": (bodies(lambda it: [it, moved(it, 1.0)]), "ids_repeated", "number them"),
     "eleven bodies": (bodies(lambda it: [moved(it, k, k) for k in range(11)]), "too_many_bodies", "max_bodies=11"),
     "two people under one id in turn": (ONE_ID_IN_TURN, "jumps", "prior.identify.enabled=true"),
-    "ten times the rate": (stamp(lambda _, k: START_NS + 7 + k * 3_333_333), "too_fast", "set fps to the rate"),
-    "messages without bodies": (message(bodies=[]), "nobody", "leaves `bodies` empty"),
+    "ten times the rate": (
+        stamp(lambda _, k: START_NS + 7 + k * 3_333_333),
+        "too_fast",
+        "set fps to that of the recording",
+    ),
+    "messages without bodies": (message(bodies=[]), "nobody", "fill `bodies`"),
     "a calibration with another floor": (posed([0, 0, 1.4], [0.0, 0, 0, 1], True), "floor", "calibrate again"),
 }
 
@@ -382,31 +386,31 @@ def test_the_page_has_every_cause() -> None:
 
 
 @pytest.mark.parametrize("identified", [False, True])
-def test_answers_that_are_of_no_use(identified: bool) -> None:
+def test_an_output_that_is_of_no_use(identified: bool) -> None:
     counters: Counter[str] = Counter()
-    answers = Answers(counters, identified=identified)
+    check = OutputCheck(counters, identified=identified)
     good = walk(1.0)
     for raw in good:
-        answers.asked(raw)
-    assert not answers.problems()
+        check.add_input(raw)
+    assert not check.problems()
     for raw in good:
-        answers.asked(raw)
+        check.add_input(raw)
         counters["joints_refused"] += 18
-    (problem,) = answers.problems()
+    (problem,) = check.problems()
     assert problem.cause == "nearly_all_refused"
     assert ("prior.identify.enabled=true" in problem.text) == (not identified), "of use only where it is off"
     flagged = clean_body(np.zeros((22, 3)), anomaly=5.0, anomaly_flag=True)
 
     def flag_all() -> None:
         for raw in good:
-            answers.given(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
+            check.add_output(PoseClean(raw.stamp_ns, "camera", "mine", raw.sensor_pose, False, 4, [flagged]))
 
     for _ in range(2):
         flag_all()
-        assert not answers.problems()  # two seconds of it are the flag's own to tell
+        assert not check.problems()  # two seconds of it are the flag's own to tell
     flag_all()
-    assert [problem.cause for problem in answers.problems()] == ["nearly_all_flagged"]
-    assert not answers.problems()
+    assert [problem.cause for problem in check.problems()] == ["nearly_all_flagged"]
+    assert not check.problems()
 
 
 def _named(raw: PoseRaw, skeleton: str) -> PoseRaw:
