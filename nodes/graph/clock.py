@@ -22,7 +22,7 @@ POLL_S = 0.1
 class Clock:
     """The system's clocks. Tests pass one that does not wait.
 
-    The wall clock can step: a machine without a battery-backed clock boots with a wrong time and sets it later.
+    The wall clock can step: a machine without a clock battery boots with a wrong time, and sets it later.
     """
 
     def now_ns(self) -> int:

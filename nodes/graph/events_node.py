@@ -16,18 +16,15 @@ REPEAT_NS = 1_000_000_000
 
 
 class EventStream:
-    """Turns one stream of ``pose/world`` into ``pose/events``.
-
-    Attributes:
-        sensor: (3,) metres, world, the sensor's position.
-        calibrated: whether it is known, and so the floor.
-    """
+    """Turns one stream of ``pose/world`` into ``pose/events``."""
 
     def __init__(self, settings: EventSettings) -> None:
         self._detector = EventDetector(settings)
         self._sent_ns: int | None = None
         self.sensor: NDArray[np.float64] = NOWHERE
+        """(3,) metres, world: the sensor's position"""
         self.calibrated = False
+        """whether it is known, and so the floor"""
 
     def process(self, world: PoseWorld) -> PoseEvents | None:
         """The events to publish for one ``pose/world``; None if there is nothing to publish."""

@@ -24,36 +24,30 @@ SAMPLES = 1000
 
 
 class Health:
-    """The measurements of one node.
-
-    Attributes:
-        state: one or a few words: ``starting``, ``running``, ``waiting for prior``, ``stopped``. It is reported as
-            ``stalled`` if frames come in and none go out.
-        unread: text that names the reliable subscribers that do not read, or empty. It replaces the state
-            ``running``.
-        counts: messages that the node itself refused or dropped, by cause.
-        published: messages published, by topic. A restarted node that resumes includes its predecessor's.
-        received: messages processed, by topic.
-        ended: topics whose end of stream was seen.
-        stamp_ns: capture stamp of the newest frame, nanoseconds.
-        queue: greatest queue length since the last report.
-        compute_ns: compute times of the newest frames, without the time that their publication waited for subscribers.
-    """
+    """The measurements of one node."""
 
     def __init__(self, clock: Clock) -> None:
         self.state = "starting"
+        """a few words, also ``waiting for prior``; reported as ``stalled`` if frames come in and none go out"""
         self.unread = ""
+        """names the reliable subscribers that do not read; replaces the state ``running``"""
         self.counts: Counter[str] = Counter()
+        """messages that the node itself refused or dropped, by cause"""
         self.published: Counter[str] = Counter()
+        """messages by topic, with those of this node's predecessor if it resumes"""
         self.received: Counter[str] = Counter()
         self.ended: set[str] = set()
+        """topics whose end of stream was received"""
         self.stamp_ns = 0
-        self._clock = clock
+        """capture stamp of the newest frame, nanoseconds"""
         self.queue = 0
+        """greatest queue length since the last report"""
+        self._clock = clock
         self._received_ns = 0
         self._unanswered_ns: int | None = None  # time of the first input since the last output
         self._latency_ns: deque[int] = deque(maxlen=SAMPLES)
         self.compute_ns: deque[int] = deque(maxlen=SAMPLES)
+        """compute times of the newest frames, without the time that their publication waited for subscribers"""
         self._first_and_last_ns: dict[str, tuple[int, int]] = {}
         self._inherited: Counter[str] = Counter()
         self._published_before: Counter[str] = Counter()
@@ -63,7 +57,6 @@ class Health:
 
     @property
     def due(self) -> bool:
-        """Whether the next report is due."""
         return self._clock.monotonic_ns() - self._reported_at >= REPORT_NS
 
     def go_on_from(self, published: Mapping[str, int]) -> None:
@@ -84,15 +77,10 @@ class Health:
         now = self._clock.monotonic_ns()
         if NODES[node].stream is None or self._unanswered_ns is None or now - self._received_ns > STALL_NS:
             return []
-        if now - self._unanswered_ns <= STALL_NS:
+        if (silent_ns := now - self._unanswered_ns) <= STALL_NS:
             return []
-        return [
-            error(
-                "no_output",
-                f"frames come in, but none went out for {(now - self._unanswered_ns) / 1e9:.0f} s: see which are "
-                "refused, and which node this one waits for",
-            )
-        ]
+        remedy = "see which are refused, and which node this one waits for"
+        return [error("no_output", f"frames come in, but none went out for {silent_ns / 1e9:.0f} s: {remedy}")]
 
     def note_published(self, topic: str, at_ns: int, latency_ns: int | None) -> None:
         """Record a message published at a monotonic time, and its latency beyond the intended delay, nanoseconds."""

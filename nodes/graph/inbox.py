@@ -20,8 +20,7 @@ LONGEST = 512
 DEADLINE_NS = 50_000_000
 """Longest time a frame waits in a node's queue while newer frames of its stream arrive, nanoseconds.
 
-After that, only the newest frame is kept. Two nodes have such a queue, so the deadline bounds the age of a published
-pose under load. The pipeline bridges the gaps."""
+After that, only the newest frame is kept. Two nodes have such a queue, so this bounds the age of a pose under load."""
 
 
 class Inbox:
@@ -139,13 +138,11 @@ class _Queue:
 
     def _make_room(self, newest: _Received, limit: int) -> None:
         """Drop all of the stream's older frames if the oldest is late, or only the oldest if the queue is full."""
+        stream = newest.topic, _source(newest.message)
         before = [
             frame
             for frame in self.waiting
-            if frame.topic == newest.topic
-            and frame is not newest
-            and _is_frame(frame.message)
-            and _source(frame.message) == _source(newest.message)
+            if frame is not newest and _is_frame(frame.message) and (frame.topic, _source(frame.message)) == stream
         ]
         if before:
             waited_ns = self._clock.monotonic_ns() - before[0].since_ns

@@ -67,9 +67,7 @@ class Launch(_EveryLaunch):
             raise LaunchError(f"nodes: expected one or more of {', '.join(NODES)}, got none")
         for node in self.nodes:
             if node not in NODES:
-                raise LaunchError(
-                    f"nodes names {node!r}, which is not a node{nearest(node, NODES)}; there are {', '.join(NODES)}"
-                )
+                raise LaunchError(f"nodes: expected of {', '.join(NODES)}, got {node!r}{nearest(node, NODES)}")
         for node, count in Counter(self.nodes).items():
             if count > 1:
                 raise LaunchError(f"nodes names {node!r} {count} times: expected each node once")
@@ -80,15 +78,11 @@ class Launch(_EveryLaunch):
 
     @classmethod
     def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> Launch:
-        """Read a launch file.
+        """Read a launch file: a path, or the name of a bundled one (``replay``, ``oak``).
 
-        Args:
-            path: a file, or the name of a bundled launch file (``replay``, ``oak``).
-            overrides: ``section.key=value`` each, which replace the file's values. A value is TOML, or plain text if it
-                is not valid TOML.
-
-        Raises:
-            LaunchError: the file does not exist, is not TOML, has an unknown key, or a value of the wrong type.
+        ``overrides``, each ``section.key=value``, replace the file's values. A value is TOML, or plain text if it is
+        not valid TOML. Raises LaunchError if the file does not exist or is not TOML, a key is unknown, or a value of
+        the wrong type.
         """
         file = find(path)
         table = read_toml(file)
@@ -190,11 +184,7 @@ def _check_integers(name: str, value: Any) -> None:
 
 
 def bundled(*parts: str) -> Path:
-    """A path inside the package, which contains launch files and one recorded stream (in a checkout, all of them).
-
-    Raises:
-        LaunchError: the path does not exist, so the installation is damaged.
-    """
+    """A path inside the package, such as of a launch file. Raises LaunchError if the installation is damaged."""
     path = PACKAGE.joinpath(*parts)
     if not path.exists():
         raise LaunchError(f"{path} does not exist, but is part of steadypose: reinstall it")
@@ -207,20 +197,18 @@ def find(launch: str | Path) -> Path:
     if path.is_file():
         return path.resolve()
     own = sorted(file.stem for file in bundled("launch").glob("*.toml"))
-    if path.parent == Path() and not path.suffix:
-        if path.name in own:
-            return bundled("launch", f"{path.name}.toml")
-        raise LaunchError(
-            f"no launch file {path.name!r}{nearest(path.name, own)}; there are {', '.join(own)}, or give a path"
-        )
-    raise LaunchError(f"no launch file at {path}{nearest(path.stem, own) if path.parent == Path() else ''}")
+    hint = nearest(path.stem, own) if path.parent == Path() else ""
+    if path.parent != Path() or path.suffix:
+        raise LaunchError(f"no launch file at {path}{hint}")
+    if path.name not in own:
+        raise LaunchError(f"no launch file {path.name!r}{hint}; there are {', '.join(own)}, or give a path")
+    return bundled("launch", f"{path.name}.toml")
 
 
 def apply_override(table: dict[str, Any], override: str) -> None:
     """Set one ``section.key=value`` in a table of settings, and create missing sections.
 
-    Raises:
-        LaunchError: the override has no ``=``, or a part of its path is a value, not a section.
+    Raises LaunchError if there is no ``=``, or a part of the path is a value, not a section.
     """
     path, separator, text = override.partition("=")
     if not separator or not path.strip():
@@ -242,7 +230,6 @@ def apply_override(table: dict[str, Any], override: str) -> None:
 
 PIPELINES = ("prior", "trajectory", "events")
 """Sections of what `clean` runs."""
-
 _SECTIONS_OF_ALL = {
     "transport": "steadypose.nodes.graph.topology:TransportSettings",
     "server": "steadypose.nodes.graph.topology:ServerSettings",
@@ -253,12 +240,8 @@ _SECTIONS_OF_ALL = {
 def full_key(override: str, sections: Mapping[str, type]) -> str:
     """Complete an abbreviated override: ``delay=2`` becomes ``prior.delay=2``.
 
-    Args:
-        override: ``key=value``; the key may lack its first parts.
-        sections: settings dataclass of each section.
-
-    Raises:
-        LaunchError: no setting has this name or ending, or several have.
+    ``sections`` has the settings dataclass of each section. Raises LaunchError if no setting, or several, have this
+    name or ending.
     """
     path, separator, value = override.partition("=")
     name = current_key(path.strip())
@@ -280,22 +263,14 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
 
 
 def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
-    """Check the settings of `PIPELINES` without loading them.
-
-    Raises:
-        LaunchError: a setting does not exist, its value is invalid, or there are no such weights.
-    """
+    """Raise LaunchError for wrong settings of `PIPELINES`, or missing weights, without loading them."""
     with launch_errors():
         for section, kind in pipeline_sections().items():
             check_weights(build_settings(kind, current_keys(section, settings.get(section, {})), section))
 
 
 def check_weights_of(launch: Launch) -> None:
-    """Check, before nodes start, that the weights of `PIPELINES` exist.
-
-    Raises:
-        LaunchError: there are no such weights.
-    """
+    """Raise LaunchError, before nodes start, if weights of `PIPELINES` do not exist."""
     with launch_errors():
         for section in launch.sections.keys() & {*PIPELINES}:
             check_weights(launch.sections[section])
@@ -307,11 +282,7 @@ def pipeline_sections() -> dict[str, type]:
 
 
 def in_launch_file(launch: str | Path, overrides: Sequence[str]) -> list[str]:
-    """Apply `full_key` over all sections of a launch file. It imports only what it needs.
-
-    Raises:
-        LaunchError: as `full_key`.
-    """
+    """Apply `full_key` over all sections of a launch file. It imports only what it needs. Raises as `full_key`."""
     if overrides:
         _add_plugins(read_toml(find(launch)).get("plugins", {}))
     kinds = {setting.name: "" for setting in fields(_EveryLaunch)} | _SECTIONS_OF_ALL | _sections()

@@ -125,7 +125,7 @@ def _compile(folder: Path, say: Callable[[str], None]) -> None:
     started = reported = time.monotonic()
     there = {file.name for other in loop_cache.readable() for file in other.iterdir()} - {loop_cache.COMPLETE}
     if there:
-        say("the program has changed since the loops were compiled: loading them, and compiling what is not there")
+        say("the program has changed since the loops were compiled: loading them, and compiling what is missing")
     else:
         say("compiling the loops for this processor, once; this takes about half a minute on two cores")
     ready: set[str] = set()

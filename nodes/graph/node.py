@@ -147,49 +147,34 @@ class Node(ABC):
         self.stopping = True
 
     def run(self) -> None:
-        """Run the node until it is stopped.
-
-        Raises:
-            TransportError: an address cannot be bound, or the configured keys cannot be used.
-        """
+        """Run the node until it is stopped. Raises TransportError if an address or the keys cannot be used."""
         transport = self.launch.transport
         keys = transport.curve_keys()
         folder, declared = transport.make_ipc_directory(), NODES[self.name]
         if not declared.subscribes or (transport.lossless and declared.delivery is not Delivery.BEST_EFFORT):
             self._relay = Relay(folder / f"{self.name}.progress", declared.publishes, self._supervisor, self._lag)
+        access = {"keys": keys, "clear_text": transport.clear_text}
         with ExitStack() as stack:
-            self._publisher = stack.enter_context(
-                Publisher(
-                    transport.endpoint(self.name),
-                    keys=keys,
-                    reliable=self._required,
-                    clear_text=transport.clear_text,
-                    resume=self._relay.resume if self._relay else None,
-                )
-            )
+            resume = self._relay.resume if self._relay else None
+            publisher = Publisher(transport.endpoint(self.name), reliable=self._required, resume=resume, **access)
+            self._publisher = stack.enter_context(publisher)
             if self._relay:
-                self._relay.begin(self._publisher)
-            if self._relay and self._relay.resume:
-                self.health.go_on_from(self._relay.resume.sequence)
+                self._relay.begin(publisher)
+            if resume:
+                self.health.go_on_from(resume.sequence)
             self._await_subscribers()
             if declared.subscribes:
-                principals = Principals()
-                self._subscribers = [
-                    stack.enter_context(
-                        Subscriber(
-                            addresses,
-                            sorted(declared.topics),
-                            reliable=transport.lossless and self.queue_limit is None,
-                            context=self._relay.context if self._relay else 0,
-                            lifespan_s=math.inf if self.queue_limit is None else transport.lifespan_s,
-                            keys=keys,
-                            clear_text=transport.clear_text,
-                            name=self.name,
-                            principals=principals,
-                        )
-                    )
-                    for addresses in self._addresses()
-                ]
+                waits = self.queue_limit is None
+                options = access | {
+                    "reliable": transport.lossless and waits,
+                    "context": self._relay.context if self._relay else 0,
+                    "lifespan_s": math.inf if waits else transport.lifespan_s,
+                    "name": self.name,
+                    "principals": Principals(),
+                }
+                for addresses in self._addresses():
+                    subscriber = Subscriber(addresses, sorted(declared.topics), **options)
+                    self._subscribers.append(stack.enter_context(subscriber))
                 self.inbox = Inbox(self._subscribers, self.queue_limit, self.clock)
             self.health.state = "running"
             self.report()
@@ -201,9 +186,10 @@ class Node(ABC):
             self.report()
 
     def _addresses(self) -> Iterator[list[str]]:
-        """Publishers' addresses, one list per subscriber. Each client has its own, so that none starves another. A
-        node that wants only diagnostics of the input, for its timeline, does not hear clients: each has another
-        timeline, and what one sends amiss is not this node's problem.
+        """Publishers' addresses, one list per subscriber. Each client has its own, so that none starves another.
+
+        A node that wants only diagnostics of the input, for its timeline, does not hear clients: each has another
+        timeline.
         """
         nodes, clients = NODES[self.name].subscribes, self.launch.server.clients
         if {*nodes.get("pose_input", ())} - {DIAGNOSTICS}:
@@ -213,7 +199,6 @@ class Node(ABC):
             yield others
 
     def work(self) -> None:
-        """Process messages until stopped."""
         while not self.stopping:
             self.take_next(POLL_S)
             self.report_if_due()
@@ -306,12 +291,10 @@ class Node(ABC):
         self.report()
 
     def report_if_due(self) -> None:
-        """Publish `diagnostics` if the last report is a second old."""
         if self.health.due:
             self.report()
 
     def report(self) -> None:
-        """Publish `diagnostics` now."""
         if self._supervisor and os.getppid() != self._supervisor:
             logger.error("%s: the process that started this node is gone; stopping", self.name)
             self.stopping = True
@@ -326,7 +309,6 @@ class Node(ABC):
         self._publisher.publish(DIAGNOSTICS, self.diagnostics(), timeout_s=0)
 
     def diagnostics(self) -> Diagnostics:
-        """The node's current diagnostics."""
         received = Counter({f"refused.{cause}": n for cause, n in self._disconnected.items()})
         received["dropped.late"] = self.inbox.overrun
         for subscriber in self._subscribers:
@@ -339,11 +321,8 @@ class Node(ABC):
 
     def _deaf_problems(self) -> Iterator[Problem]:
         if self._deaf:
-            yield error(
-                "deaf",
-                f"{', '.join(sorted(self._deaf))} has not read for {DEAF_S:g} s, and is not waited for any more; "
-                "it counts what it misses: stop it or restart it; if it is a second subscriber of that name, rename it",
-            )
+            text = f"{', '.join(sorted(self._deaf))} has not read for {DEAF_S:g} s, and is not waited for any more"
+            yield error("deaf", f"{text}: restart it or, if it is a second subscriber of that name, rename it")
 
     def _wire_problems(self) -> Iterator[Problem]:
         """Problems with refused frames since the last call."""

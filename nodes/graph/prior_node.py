@@ -8,7 +8,7 @@ from typing import Any
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW
 from steadypose.msgs.types import Message, PoseRaw
 from steadypose.nodes.checks.problem import Problem, error, warning
-from steadypose.nodes.checks.stream import Answers, StreamChecks
+from steadypose.nodes.checks.stream import OutputCheck, StreamChecks
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.inbox import BodyLimit
 from steadypose.nodes.graph.launch import Launch
@@ -22,17 +22,14 @@ from steadypose.prior.clean.settings import PriorSettings
 
 GATED = ("joints_refused", "limbs_exchanged", "joints_mirrored", "joints_stuck")
 """Counters of the gate's outlier rejection. They are normal operation, not refused messages."""
-
 OWN_SOURCE_NS, FOREIGN_SOURCE_NS = 10_000_000_000, 2_000_000_000
 """Longest time until a source's first message, nanoseconds: of a source that this launch starts, and of one that should
 be running already."""
 
 
 def make_prior(settings: Mapping[str, Any]) -> PriorPipeline:
-    """Create the prior of one stream from ``[prior]`` of a launch file.
-
-    Raises:
-        LaunchError: a setting is unknown, its value is invalid, or weights are missing.
+    """Create the prior of one stream from ``[prior]`` of a launch file. Raises LaunchError for wrong settings or
+    weights.
     """
     with launch_errors():
         return PriorPipeline(PriorSettings.from_dict(settings))
@@ -53,7 +50,7 @@ class PriorNode(Node):
         self._bodies = 0
         self._anomalies = 0
         self._overrun_before = 0
-        self._answers = Answers(self._pipeline.counters, identified=settings.identify.enabled)
+        self._output_check = OutputCheck(self._pipeline.counters, identified=settings.identify.enabled)
         self._checks = StreamChecks(settings, clients or 1)
         # such a replay has no timeline
         self._unpaced = "pose_input" in launch.nodes and not launch.settings(load(NODES["pose_input"].settings)).rate
@@ -65,7 +62,7 @@ class PriorNode(Node):
         if not isinstance(message, PoseRaw):
             return
         self._checks.see(message, self.clock.now_ns())
-        self._answers.asked(message)
+        self._output_check.add_input(message)
         started_ns, gap = self.clock.monotonic_ns(), self.inbox.dropped_of(message)
         if isinstance(self._pipeline, StreamBatch):
             cleaned = self._pipeline.process_at(message, started_ns, hurry=self.behind, gap=gap)
@@ -78,7 +75,7 @@ class PriorNode(Node):
         for clean in cleaned:
             self._bodies = len(clean.bodies)
             self._anomalies += sum(body.anomaly_flag for body in clean.bodies)
-            self._answers.given(clean)
+            self._output_check.add_output(clean)
             self.publish(POSE_CLEAN, clean, delay_ns=round(clean.delay_frames * FRAME_NS))
 
     def problems(self) -> list[Problem]:
@@ -93,15 +90,11 @@ class PriorNode(Node):
         patience_ns = OWN_SOURCE_NS if own else FOREIGN_SOURCE_NS
         since_ns = self.clock.monotonic_ns() - self._started_ns
         if not self._checks.seen and since_ns > patience_ns:
-            since_s, addresses = since_ns / 1e9, ", ".join(self.launch.addresses("pose_input"))
+            expected = f"expected a publisher at {', '.join(self.launch.addresses('pose_input'))}"
             remedy = "see what pose_input reports" if own else "start the tracker, or let it bind that address"
-            return [
-                error(
-                    "no_source",
-                    f"no {POSE_RAW} since the start {since_s:.0f} s ago: expected a publisher at {addresses}; {remedy}",
-                )
-            ]
-        in_general = self._answers.problems()
+            since = f"since the start {since_ns / 1e9:.0f} s ago"
+            return [error("no_source", f"no {POSE_RAW} {since}: {expected}; {remedy}")]
+        of_output = self._output_check.problems()
         late, self._overrun_before = self.inbox.overrun > self._overrun_before, self.inbox.overrun
         if late and (slow := [problem for problem in found if problem.cause.endswith("slow")]):
             # it is this node that skips frames, not the source
@@ -109,8 +102,8 @@ class PriorNode(Node):
             found.append(self._overload("few of the frames: only the newest are processed"))
         if (bodies := self._limit.bodies) < (offered := self._pipeline.offered):
             too_much = f"{bodies} of {offered} bodies: those farthest from the sensor are left out"
-            return [*(found or in_general), self._overload(too_much)]
-        return found or in_general
+            return [*(found or of_output), self._overload(too_much)]
+        return found or of_output
 
     def _overload(self, too_much: str) -> Problem:
         stages = " and ".join(f"[prior.{stage}]" for stage in self._optional)
@@ -118,9 +111,8 @@ class PriorNode(Node):
         return warning("overload", f"this machine has time for {too_much}; {remedy}")
 
     def status(self) -> dict[str, str]:
-        counts = {
-            f"{'gate' if cause in GATED else 'refused'}.{cause}": str(n) for cause, n in self._pipeline.counters.items()
-        }
+        counters = self._pipeline.counters.items()
+        counts = {f"{'gate' if cause in GATED else 'refused'}.{cause}": str(n) for cause, n in counters}
         if isinstance(self._pipeline, StreamBatch):
             counts["streams"] = str(self._pipeline.streams)
         if noise := self._pipeline.sensor_noise:

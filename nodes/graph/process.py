@@ -35,10 +35,8 @@ def own_environment() -> dict[str, str]:
 
 _DONTNEED = 4
 """``MADV_DONTNEED`` of madvise(2)"""
-
 _COMPILED = "STEADYPOSE_COMPILED"
 """Name of the environment variable that marks a process restarted after compiling."""
-
 _STARTS_WITH = 400_000
 """Garbage collector's threshold during start-up, objects. A start that compiles nothing creates fewer."""
 
@@ -83,9 +81,9 @@ def stop_on_signals(stop: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _give_back() -> None:
-    """Return malloc's free memory and LLVM's code pages to the system; a process with loaded loops compiles none.
+    """Return malloc's free memory and LLVM's code pages to the system.
 
-    If it compiles one after all, the pages are read from the file again.
+    A process with loaded loops compiles none; if it does after all, the pages are read from the file again.
     """
     libc = ctypes.CDLL(None)
     if hasattr(libc, "malloc_trim"):

@@ -97,13 +97,11 @@ class Relay:
         return self._answered is not None
 
     def published(self, publisher: Publisher, topic: str, mark: tuple[int, int]) -> None:
-        """Record a message that was just published."""
         if topic in self._topics:
             self._untaken.append((topic, publisher.deliveries.sequence[topic] - 1, mark))
             self._published += 1
 
     def handled(self) -> None:
-        """Record that an input was processed."""
         self._inputs.append(self._published)
 
     def settle(self, publisher: Publisher, timeout_s: float = 0.0) -> int:

@@ -26,8 +26,9 @@ HEALTH_FILE = "health.json"
 
 @contextmanager
 def run_lock(launch: Launch) -> Iterator[bool]:
-    """Lock the addresses of a run's nodes. Yields whether this run writes ``health.json``; otherwise another run with
-    other nodes does. Raises LaunchError if another run uses one of the addresses.
+    """Lock the addresses of a run's nodes. Yields whether this run, and no other, writes ``health.json``.
+
+    Raises LaunchError if another run uses one of the addresses.
     """
     directory = launch.transport.make_ipc_directory()
     with ExitStack() as stack:
@@ -39,10 +40,8 @@ def run_lock(launch: Launch) -> Iterator[bool]:
                 make_private(local_directory())
                 holder = _take(stack, f"{local_directory()}/{endpoint.replace('/', '')}.lock")
             if holder is not None:
-                raise LaunchError(
-                    f"{name} runs already at {endpoint}, in another `steadypose run`{holder}: stop that one, or "
-                    "give this one addresses of its own ([transport] directory, or [transport.endpoints])"
-                )
+                remedy = "stop that one, or give this one a [transport] directory or [transport.endpoints] of its own"
+                raise LaunchError(f"{name} runs already at {endpoint}, in another `steadypose run`{holder}: {remedy}")
         yield _take(stack, f"{directory}/health.lock") is None
 
 
@@ -150,9 +149,8 @@ def write_health(
 
 def _node(name: str, supervisor: Supervisor, latest: Diagnostics | None) -> dict[str, Any]:
     child = supervisor.children[name]
-    known = child.state == "running" and latest is not None
     status: dict[str, Any] = {"state": child.state, "restarts": child.restarts, "silent_s": round(child.silent_s, 1)}
-    if known and latest:
+    if child.state == "running" and latest is not None:
         values, stream = latest.values, NODES[name].stream
         status |= {
             "state": values.get("state", child.state).partition(" ")[0],

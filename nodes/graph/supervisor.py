@@ -47,12 +47,8 @@ class Child:
     ) -> None:
         self.name = name
         self.state = "ended"
-        self.restarts = 0
-        self._command = command
-        self._run = run
-        self._clock = clock
-        self._log = log
-        self._crashes = 0
+        self.restarts = self._crashes = 0
+        self._command, self._run, self._clock, self._log = command, run, clock, log
         self._was_heard = False
         self._start()
 
@@ -73,7 +69,6 @@ class Child:
         return self.state == "running" and self._heard_ns is not None
 
     def heard(self) -> None:
-        """Record a report of the node."""
         if self.state in ("running", "stale"):
             self._heard_ns = self._clock.monotonic_ns()
             self._was_heard = True

@@ -172,11 +172,9 @@ _NODES: dict[str, NodeDeclaration] = {
     ),
 }
 NODES: Mapping[str, NodeDeclaration] = MappingProxyType(_NODES)
-"""Declarations by node name, in the order in which nodes are stopped.
+"""Declarations by node name, in the order in which nodes are stopped, those of other packages last.
 
-This is the order of the stream, so that messages in flight still arrive and are recorded. Nodes of other packages come
-last."""
-
+This is the order of the stream, so that messages in flight still arrive and are recorded."""
 POSE_NODES = tuple(name for name, declared in NODES.items() if declared.publishes and not declared.optional)
 """Names of the nodes that publish poses. They run unless a launch file names others."""
 
@@ -225,14 +223,11 @@ class TransportSettings:
         taken: dict[str, str] = {}
         for node, address in self.endpoints.items():
             if node not in NODES:
-                raise LaunchError(
-                    f"[transport.endpoints] names {node!r}, which is not a node{nearest(node, NODES)}; "
-                    f"nodes are {', '.join(NODES)}"
-                )
+                got = f"{node!r}{nearest(node, NODES)}"
+                raise LaunchError(f"[transport.endpoints] expected of {', '.join(NODES)}, got {got}")
             if (other := taken.setdefault(address, node)) != node and not address.endswith(":*"):
-                raise LaunchError(
-                    f"[transport.endpoints] {node}: expected an address of its own, got {address}, as for {other}"
-                )
+                got = f"{address}, as for {other}"
+                raise LaunchError(f"[transport.endpoints] {node}: expected an address of its own, got {got}")
         if not self.lifespan_s > 0:
             raise LaunchError(f"[transport] lifespan_s: expected more than 0, got {self.lifespan_s}")
         if self.queue < 1:
@@ -240,16 +235,10 @@ class TransportSettings:
 
     def endpoint(self, node: str) -> str:
         """The address at which ``node`` publishes."""
-        if node in self.endpoints:
-            return self.endpoints[node]
-        return f"ipc://{self.ipc_directory / node}"
+        return self.endpoints[node] if node in self.endpoints else f"ipc://{self.ipc_directory / node}"
 
     def curve_keys(self) -> Keys | None:
-        """The configured CurveZMQ keys; None if none are configured.
-
-        Raises:
-            TransportError: the keys are missing, or have unsafe permissions.
-        """
+        """The configured CurveZMQ keys; None if none are. Raises TransportError if they cannot be used."""
         return load_keys(self.keys) if self.keys else None
 
     @property
@@ -258,11 +247,7 @@ class TransportSettings:
         return Path(self.directory) if self.directory else local_directory()
 
     def make_ipc_directory(self) -> Path:
-        """Create the directory of the sockets, accessible to this user only.
-
-        Raises:
-            TransportError: it exists, and others may write to it.
-        """
+        """Create the sockets' directory for this user only. Raises TransportError if others may write to it."""
         make_private(self.ipc_directory)
         return self.ipc_directory
 

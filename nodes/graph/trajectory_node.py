@@ -21,11 +21,7 @@ PATIENCE_NS = 2_000_000_000
 
 
 def make_trajectory(settings: Mapping[str, Any]) -> TrajectoryPipeline:
-    """Create the trajectory pipeline from ``[trajectory]`` of a launch file.
-
-    Raises:
-        LaunchError: a setting is unknown, its value is invalid, or weights are missing.
-    """
+    """Create the pipeline from ``[trajectory]`` of a launch file. Raises LaunchError for wrong settings or weights."""
     with launch_errors():
         return TrajectoryPipeline(TrajectorySettings.from_dict(settings))
 
@@ -73,13 +69,10 @@ class TrajectoryNode(Node):
         # a prior of this launch reports itself that nothing comes
         if self._seen or "prior" in self.launch.nodes or since_ns < PATIENCE_NS:
             return []
-        return [
-            error(
-                "no_source",
-                f"no {POSE_CLEAN} since the start {since_ns / 1e9:.0f} s ago: expected a prior that publishes at "
-                f"{', '.join(self.launch.addresses('prior'))}; add 'prior' to nodes, or start it where it runs",
-            )
-        ]
+        expected = f"expected a prior that publishes at {', '.join(self.launch.addresses('prior'))}"
+        since = f"since the start {since_ns / 1e9:.0f} s ago"
+        remedy = "add 'prior' to nodes, or start it where it runs"
+        return [error("no_source", f"no {POSE_CLEAN} {since}: {expected}; {remedy}")]
 
     def status(self) -> dict[str, str]:
         counters = sum((p.counters for p in self._client_pipelines.values()), self._pipeline.counters)

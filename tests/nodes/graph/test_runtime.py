@@ -213,7 +213,7 @@ def test_a_replay_goes_on_at_its_pace(make_launch: Callable[..., Launch], step_n
         node.report = lambda: None  # type: ignore[method-assign]
         node._wait_for(frame.stamp_ns, frame.stamp_ns)
         assert clock.time_ns - before <= 40_000_000
-        node._tell_pace()
+        node._set_timeline()
         assert node.timeline is not None
         assert abs(node.timeline.wall(frame.stamp_ns) - clock.now_ns()) < 1_000_000
 
