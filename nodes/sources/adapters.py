@@ -30,21 +30,21 @@ MIN_POINTS = 6
 def from_mediapipe(
     result: Any, stamp_ns: int, image_size: tuple[int, int], intrinsics: Floats, source: str = "mediapipe"
 ) -> PoseRaw:
-    """Convert the result of MediaPipe's pose landmarker.
+    """Convert the result of MediaPipe's pose landmarker, a ``PoseLandmarkerResult``.
 
     World landmarks are relative to the middle of the hips. The body is placed so that they project onto the image's
     landmarks.
 
     Args:
-        result: ``PoseLandmarkerResult`` with ``pose_world_landmarks`` and ``pose_landmarks``.
+        result: its ``pose_world_landmarks`` and ``pose_landmarks`` are read.
         stamp_ns: capture time, nanoseconds.
         image_size: width and height in pixels.
         intrinsics: (3, 3) of the camera. For an uncalibrated camera, a guess (`pinhole`) affects only the distance.
         source: the camera's name.
 
     Returns:
-        Bodies in the optical frame (x right, y down, z forward) of a camera assumed to be level. A body with too few
-        observed landmarks to determine its position is omitted.
+        Bodies in the optical frame (x right, y down, z forward) of a camera assumed to be level, without those of which
+        too few landmarks are observed.
     """
     bodies = []
     for number, (world, image) in enumerate(zip(result.pose_world_landmarks, result.pose_landmarks, strict=True)):
@@ -60,22 +60,15 @@ def from_mediapipe(
 def from_zed(message: Any, source: str = "zed") -> PoseRaw:
     """Convert ``ObjectsStamped`` of the ZED ROS 2 wrapper (``body_trk/skeletons``), in its frame, whose z points up.
 
-    Args:
-        message: skeletons of 38 key points; set ``body_format: BODY_38`` in the wrapper's configuration.
-        source: the camera's name.
-
-    Raises:
-        ValueError: the skeletons have another format.
+    Set ``body_format: BODY_38`` in the wrapper's configuration: other skeletons raise ValueError.
     """
     bodies = []
     for person in message.objects:
         if not person.skeleton_available:
             continue
         if person.body_format != ZED_BODY_38:
-            raise ValueError(
-                f"ZED body_format: expected {ZED_BODY_38} (38 key points), got {person.body_format}; set "
-                "body_tracking.body_format to BODY_38"
-            )
+            got = f"got {person.body_format}; set body_tracking.body_format to BODY_38"
+            raise ValueError(f"ZED body_format: expected {ZED_BODY_38} (38 key points), {got}")
         points = [point.kp for point in person.skeleton_3d.keypoints][: len(ZED38.joints)]
         joints = _table(ZED38, points, "skeleton_3d.keypoints")
         # ZED gives one confidence per body, 1 to 99
@@ -85,10 +78,10 @@ def from_zed(message: Any, source: str = "zed") -> PoseRaw:
 
 
 def from_azure_kinect(markers: Any, source: str = "azure_kinect") -> PoseRaw | None:
-    """Convert ``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's frame.
+    """Convert ``MarkerArray`` of the Azure Kinect ROS driver (``body_tracking_data``), in the depth camera's optical
+    frame.
 
-    Returns:
-        Bodies in the optical frame; None for an array without markers, because it has no stamp either.
+    Returns None for an array without markers, because it has no stamp either.
     """
     found: dict[int, Floats] = {}
     for marker in markers.markers:

@@ -1,8 +1,7 @@
-"""Cameras as sources: OAK cameras, webcams with MediaPipe, and several calibrated cameras merged into one source
-(``[input] source = "merge"``). A camera that is unplugged is reopened when it returns.
+"""Cameras as sources: OAK cameras, webcams with MediaPipe, and several calibrated cameras merged into one source.
 
-The code that needs depthai is in `nodes.sources.oak_device`, that for OpenCV and MediaPipe in
-`nodes.sources.webcam_device`. Both are imported only when a camera is opened.
+A camera that is unplugged is reopened when it returns. `oak_device` needs depthai, `webcam_device` OpenCV and
+MediaPipe: both are imported only when a camera is opened.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ logger = logging.getLogger(__name__)
 
 PAUSES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 """Pauses before successive attempts to open the camera, seconds; the last one repeats."""
-
 STREAMING = "streaming"
 
 
@@ -56,7 +54,7 @@ class Connection(Protocol):
 class CameraSource(LiveSource):
     """The skeletons of a camera. While it is disconnected, it is retried forever at growing intervals.
 
-    ``connect`` opens the camera; it raises RuntimeError if it cannot be opened at present.
+    ``connect`` opens the camera; it raises RuntimeError if it cannot at present.
     """
 
     def __init__(self, clock: Clock, connect: Callable[[], AbstractContextManager[Connection]]) -> None:
@@ -97,11 +95,8 @@ class CameraSource(LiveSource):
     def problems(self) -> list[Problem]:
         if self._state == STREAMING or not self._tried:
             return []
-        return [
-            warning(
-                "camera", f"{self._state}; expected a camera that gives frames; `steadypose doctor` lists the cameras"
-            )
-        ]
+        expected = "expected a camera that gives frames; `steadypose doctor` lists the cameras"
+        return [warning("camera", f"{self._state}; {expected}")]
 
     def status(self) -> dict[str, str]:
         values = {"camera": self._state, "camera.connections": str(self._connections)}
@@ -117,10 +112,8 @@ class CameraSource(LiveSource):
 def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
     """Create the source for an OAK camera. Raises LaunchError if a setting cannot be used."""
     if settings.archive and not (settings.archive.endswith(".tar.xz") and Path(settings.archive).is_file()):
-        raise LaunchError(
-            f"[input.oak] archive: expected a file that is an NN archive (.tar.xz), got {settings.archive}; "
-            "Luxonis' hub has some, their modelconverter makes others"
-        )
+        got = f"{settings.archive}; Luxonis' hub has some, their modelconverter makes others"
+        raise LaunchError(f"[input.oak] archive: expected an NN archive (.tar.xz), got {got}")
 
     def connect_oak() -> AbstractContextManager[Connection]:
         from steadypose.nodes.sources.oak_device import connect  # imports depthai
@@ -131,21 +124,13 @@ def open_oak(settings: OakSettings, context: SourceContext) -> CameraSource:
 
 
 def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSource | VideoSource:
-    """Create the source for a webcam, or for the video given in its place.
-
-    Raises:
-        LaunchError: the model is missing, or a setting cannot be used.
-    """
+    """Create the source for a webcam, or for the video given in its place. Raises LaunchError for a wrong setting."""
     if settings.model and not Path(settings.model).is_file():
-        raise LaunchError(
-            f"[input.webcam] model: expected a pose landmarker for MediaPipe, a .task file, got {settings.model!r}; "
-            f"download one, such as {MODEL}, or leave it out: MediaPipe's own finds one body"
-        )
+        got = f"got {settings.model!r}; download one, such as {MODEL}, or leave it out: MediaPipe's own finds one body"
+        raise LaunchError(f"[input.webcam] model: expected a pose landmarker for MediaPipe, a .task file, {got}")
     if settings.bodies > 1 and not settings.model:
-        raise LaunchError(
-            f"[input.webcam] bodies: MediaPipe's own model finds one, got {settings.bodies}; for more, give a model, "
-            f"such as {MODEL}"
-        )
+        got = f"got {settings.bodies}; for more, give a model, such as {MODEL}"
+        raise LaunchError(f"[input.webcam] bodies: MediaPipe's own model finds one, {got}")
 
     def connect_webcam() -> AbstractContextManager[Connection]:
         from steadypose.nodes.sources.webcam_device import connect  # imports OpenCV
@@ -176,17 +161,14 @@ class MergeSettings:
 class MergeSource(LiveSource):
     """Merges ``pose/raw`` of several cameras, each with its own input node and calibration.
 
-    Raises:
-        LaunchError: fewer than two cameras are named, or one is named twice.
+    Raises LaunchError if fewer than two cameras are named, or one is named twice.
     """
 
     def __init__(self, settings: MergeSettings, context: SourceContext) -> None:
         super().__init__()
-        if len(set(settings.cameras)) < 2 or len(set(settings.cameras)) != len(settings.cameras):
-            raise LaunchError(
-                "[input.merge] cameras: expected the addresses of two input nodes or more, each once, such as "
-                f"tcp://192.168.1.21:7111; got {settings.cameras}"
-            )
+        if not 2 <= len(set(settings.cameras)) == len(settings.cameras):
+            expected = "the addresses of two input nodes or more, each once, such as tcp://192.168.1.21:7111"
+            raise LaunchError(f"[input.merge] cameras: expected {expected}; got {settings.cameras}")
         from steadypose.prior.camera.multi_view import Merge  # imported late, so that launch files load without scipy
 
         self._addresses, self._context = settings.cameras, context
@@ -218,24 +200,16 @@ class MergeSource(LiveSource):
         self._before = [count.copy() for count in counts]
         found = list(check_wire({", ".join(self._addresses): unread}))
         if unplaced := [camera for camera in received if refused[f"not calibrated, {camera}"]]:
-            found.append(
-                error(
-                    "camera_uncalibrated",
-                    f"{', '.join(unplaced)}: not merged, because nobody knows where it stands: expected the "
-                    "[input.calibration] that `steadypose calibrate pose` writes, in its own launch file "
-                    "(docs/calibrate.md)",
-                )
-            )
+            expected = "expected [input.calibration] in its own launch file, as `steadypose calibrate pose` writes it"
+            text = f"{', '.join(unplaced)}: not merged, because its place is unknown: {expected} (docs/calibrate.md)"
+            found.append(error("camera_uncalibrated", text))
         late = {camera: refused[f"late or repeated, {camera}"] for camera in received}
         if behind := [camera for camera, n in late.items() if n >= ENOUGH and n > received[camera] / 2]:
-            found.append(
-                error(
-                    "camera_late",
-                    f"{', '.join(behind)}: hardly merged, because by their stamps most frames come after later ones "
-                    "of another camera were merged: expected clocks that agree within a few milliseconds; synchronise "
-                    "them (NTP or PTP), or use a faster network",
-                )
+            text = (
+                f"{', '.join(behind)}: hardly merged, because most frames come after later ones of another camera: "
+                "expected clocks that agree within milliseconds; synchronise them (NTP or PTP), or use a faster network"
             )
+            found.append(error("camera_late", text))
         return found
 
     def status(self) -> dict[str, str]:

@@ -27,19 +27,14 @@ from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
 HIGHEST = 100.0
 """Largest height of a camera above the floor, metres."""
-
 LONGEST_GAP_NS = 200_000_000
 """Longest gap over which key points are interpolated, nanoseconds."""
-
 LONGEST_NS = 24 * 3600 * 10**9
 """Longest duration of a recording, nanoseconds. It prevents a single wrong stamp from creating a grid of years."""
-
 NORMALISED = 2.0
 """Largest coordinate of key points that are not pixels; those of a normalised image may lie a little outside of it."""
-
 MOSTLY = 0.95
 """Share of frames with shoulders below hips from which on the image's y axis is probably the other."""
-
 _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
 
 
@@ -56,11 +51,7 @@ def has_key_points(path: Path) -> bool:
 
 
 def read_key_points(path: Path) -> KeyPointRecording:
-    """Read and check a file of key points.
-
-    Raises:
-        NpzError: an array is missing, or has the wrong form. The text says what was expected.
-    """
+    """Read and check a file of key points. Raises NpzError if an array is missing, or has the wrong form."""
     arrays = read_arrays(path)
     missing = [name for name in ("skeleton", "focal", "centre") if name not in arrays]
     if missing:
@@ -108,10 +99,9 @@ def read_key_points(path: Path) -> KeyPointRecording:
     if not np.isfinite(pixels).any():
         raise NpzError(f"{path}: keypoints: expected somebody, got no key point that is finite and has a confidence")
     if np.nanmax(np.abs(pixels)) <= NORMALISED:
-        raise NpzError(
-            f"{path}: keypoints: expected pixels, as focal and centre, got {np.nanmin(pixels):.2g} to "
-            f"{np.nanmax(pixels):.2g}, as of a normalised image; multiply x by its width and y by its height"
-        )
+        got = f"{np.nanmin(pixels):.2g} to {np.nanmax(pixels):.2g}, as of a normalised image"
+        remedy = "multiply x by its width and y by its height"
+        raise NpzError(f"{path}: keypoints: expected pixels, as focal and centre, got {got}; {remedy}")
     count = int((stamps[-1] - stamps[0]) / FRAME_NS + 1e-3) + 1
     grid = stamps[0] + np.round(np.arange(count) * FRAME_NS).astype(np.int64)
     after = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)

@@ -33,7 +33,6 @@ logger = logging.getLogger(__name__)
 
 CLEANED = ("world_positions", "state")
 """Names of arrays that an output has and an input lacks."""
-
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -43,9 +42,9 @@ def is_output(arrays: Arrays) -> bool:
 
 
 def as_input(arrays: Arrays) -> Arrays:
-    """Convert the arrays of an output to those of an input; the arrays of an input are returned unchanged.
+    """Convert the arrays of an output to those of an input: observed joints in the world, z up; imputed ones are NaN.
 
-    The positions are the output's observed joints in the world, z up. Imputed joints are NaN.
+    The arrays of an input are returned unchanged.
     """
     if not is_output(arrays):
         return arrays
@@ -57,7 +56,6 @@ def as_input(arrays: Arrays) -> Arrays:
 
 STAMPS_END_NS = 2**31 * 10**9
 """Upper bound of stamps, nanoseconds. ROS 2 stores seconds in an int32."""
-
 _ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body_id")
 _OPTIONAL = {"confidence", "up", "body_id"}
 
@@ -67,14 +65,9 @@ class NpzError(ValueError):
 
 
 class ArraySource:
-    """The frames of arrays as messages; a source for `steadypose.clean`.
+    """The frames of arrays, by their names in an ``.npz`` (see the module), as messages; ``path`` names them in errors.
 
-    Args:
-        path: the arrays' file, or their name in errors.
-        arrays: arrays by their names in an ``.npz`` (see the module).
-
-    Raises:
-        NpzError: an array is missing, or has the wrong form.
+    Raises NpzError if an array is missing, or has the wrong form.
     """
 
     def __init__(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -125,26 +118,12 @@ class ArraySource:
                 for id, joints, sure in zip(self._ids, positions, confidence, strict=True)
                 if alone or not np.isnan(joints).all()
             ]
-            yield (
-                POSE_RAW,
-                PoseRaw(
-                    stamp_ns=int(stamp_ns),
-                    frame_id="sensor",
-                    source=as_text(self.path.stem),
-                    skeleton=self._skeleton,
-                    sensor_pose=self._sensor_pose,
-                    calibrated=False,
-                    bodies=bodies,
-                ),
-            )
+            source = as_text(self.path.stem)
+            yield (POSE_RAW, PoseRaw(int(stamp_ns), "sensor", source, self._skeleton, self._sensor_pose, False, bodies))
 
 
 class NpzSource(ArraySource):
-    """The frames of an ``.npz`` as messages; a source for the input node and for ``steadypose clean``.
-
-    Raises:
-        NpzError: an array is missing, or has the wrong form.
-    """
+    """The frames of an ``.npz`` as messages. Raises NpzError if an array is missing, or has the wrong form."""
 
     def __init__(self, path: Path) -> None:
         arrays = read_arrays(path, known := (*_ARRAYS, *CLEANED))
@@ -158,8 +137,7 @@ class NpzSource(ArraySource):
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
     """Read the arrays ``names`` of an ``.npz``, if it has them; None reads all.
 
-    Raises:
-        NpzError: the file cannot be read, or contains pickled objects, which could run code.
+    Raises NpzError if the file cannot be read, or contains pickled objects, which could run code.
     """
     if not zipfile.is_zipfile(path):
         raise NpzError(f"{path}: cannot be read as .npz: expected a zip archive of arrays, as numpy.savez writes it")
@@ -176,10 +154,8 @@ def _array(path: Path, arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray
     if name not in arrays:
         # `arrays` are those that are known: a misspelt one is in the file alone
         there = [Path(n).stem for n in zipfile.ZipFile(path).namelist()] if zipfile.is_zipfile(path) else list(arrays)
-        raise NpzError(
-            f"{path}: expected an array {name!r}; it has {', '.join(there) or 'none'}; needed are "
-            "positions (T, J, 3), skeleton, and fps or stamp_ns"
-        )
+        got = f"got {', '.join(there) or 'none'}; needed are positions (T, J, 3), skeleton, and fps or stamp_ns"
+        raise NpzError(f"{path}: expected an array {name!r}, {got}")
     return arrays[name]
 
 
@@ -204,28 +180,24 @@ def _ids(path: Path, arrays: Mapping[str, NDArray[Any]], bodies: int) -> list[in
     ids = arrays["body_id"]
     fit = ids.dtype.kind in "iu" and ids.shape == (bodies,) and len(set(ids.tolist())) == bodies
     if not fit or np.abs(ids.astype(np.float64)).max(initial=0) >= 2**31:
-        raise NpzError(
-            f"{path}: body_id: expected {bodies} different integers of 32 bits, one for each body of positions; got "
-            f"{ids.dtype} of shape {ids.shape}"
-        )
+        expected = f"{bodies} different integers of 32 bits, one for each body of positions"
+        raise NpzError(f"{path}: body_id: expected {expected}; got {ids.dtype} of shape {ids.shape}")
     return ids.tolist()
 
 
 def read_stamps(path: Path, arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.int64]:
     """(T,) capture times, nanoseconds: ``stamp_ns``, or counted from 0 at ``fps``.
 
-    Raises:
-        NpzError: both are missing, the length is wrong, or a stamp exceeds what a message can hold.
+    Raises NpzError if both are missing, or of the wrong length, or too large for a message.
     """
     if "stamp_ns" in arrays:
         stamps = arrays["stamp_ns"]
         fit = stamps.dtype.kind in "iu" and stamps.shape == (frames,)
         if not fit or stamps.min() < 0 or stamps.max() >= STAMPS_END_NS:
             span = f", {stamps.min()} to {stamps.max()}" if stamps.size and stamps.dtype.kind in "iuf" else ""
-            raise NpzError(
-                f"{path}: stamp_ns: expected {frames} integers of 0 or more and under {STAMPS_END_NS}, nanoseconds of "
-                f"capture; got {stamps.dtype} of shape {stamps.shape}{span}{stamps_hint(stamps, frames)}"
-            )
+            expected = f"{frames} integers of 0 or more and under {STAMPS_END_NS}, nanoseconds of capture"
+            got = f"{stamps.dtype} of shape {stamps.shape}{span}{stamps_hint(stamps, frames)}"
+            raise NpzError(f"{path}: stamp_ns: expected {expected}; got {got}")
         return stamps.astype(np.int64)
     if "fps" in arrays:
         fps = arrays["fps"]
@@ -243,14 +215,10 @@ SUFFIXES = (".bvh", ".trc", ".c3d", ".npy")
 
 
 class MotionSource(ArraySource):
-    """The body in a motion capture file, in canonical joints, z up.
+    """The body in a motion capture file, in canonical joints, z up. Raises MotionError if there is none.
 
-    ``rig`` says what the file itself lacks (`prior.mocap.files.Description`), as a TOML table. A body far from the
-    file's origin is given relative to the middle of its path, where the sensor is then said to be; the world is
-    the file's.
-
-    Raises:
-        MotionError: the file cannot be read, or no body is recognised in it.
+    ``rig`` is what the file itself lacks (`prior.mocap.files.Description`), as a TOML table. A body far from the file's
+    origin is given relative to the middle of its path, where the sensor is then said to be; the world is the file's.
     """
 
     def __init__(self, path: Path, rig: Mapping[str, Any]) -> None:
@@ -262,12 +230,8 @@ class MotionSource(ArraySource):
         super().__init__(path, arrays)
         self._sensor_pose = Pose(place, self._sensor_pose.orientation)
         if place.any():
-            logger.warning(
-                "%s: the body is far from the origin: its positions are relative to %s m, those in the world are the "
-                "file's",
-                path,
-                place.round(2).tolist(),
-            )
+            text = "%s: the body is far from the origin: positions are relative to %s m, except in the world"
+            logger.warning(text, path, place.round(2).tolist())
 
 
 def _middle(positions: NDArray[np.floating]) -> NDArray[np.float64]:

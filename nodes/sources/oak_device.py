@@ -57,9 +57,7 @@ def _nanoseconds(time: timedelta) -> int:
 class Skeletons(dai.node.HostNode):
     """Converts pairs of detections (with key points) and depth images of the same time to skeletons.
 
-    Attributes:
-        found: queue of skeletons.
-        counts: number of frames dropped or refused, by cause.
+    ``found`` is a queue of skeletons; ``counts`` counts frames dropped or refused, by cause.
     """
 
     def __init__(self) -> None:
@@ -71,14 +69,10 @@ class Skeletons(dai.node.HostNode):
         self._epoch_ns = 0
 
     def build(self, pairs: dai.Node.Output, level: GravityEstimator, source: str, epoch_ns: int) -> "Skeletons":
-        """Link the node.
+        """Link the node to pairs of ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``,
+        millimetres, aligned to the image of the detections).
 
-        Args:
-            pairs: output of pairs: ``detections`` (``ImgDetections`` with key points) and ``depth`` (``ImgFrame``,
-                millimetres, aligned to the image of the detections).
-            level: estimator of the camera's orientation by gravity.
-            source: the camera's name, for the messages.
-            epoch_ns: wall time of zero on depthai's clock, nanoseconds since 1970.
+        ``source`` is the camera's name, ``epoch_ns`` the wall time of zero on depthai's clock, ns since 1970.
         """
         self.link_args(pairs)
         self._level, self._source, self._epoch_ns = level, source, epoch_ns
@@ -142,11 +136,7 @@ class ImuReader(dai.node.HostNode):
 
 
 class Images(dai.node.HostNode):
-    """Stores the newest image for the viewer.
-
-    Attributes:
-        counts: number of images that could not be stored, by cause.
-    """
+    """Stores the newest image for the viewer; ``counts`` counts images that could not be stored, by cause."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -228,11 +218,7 @@ class Host:
 
 
 def open_device(settings: OakSettings) -> dai.Device:
-    """Open the camera that the settings name.
-
-    Raises:
-        RuntimeError: there is no such camera, or it cannot be opened.
-    """
+    """Open the camera that the settings name. Raises RuntimeError if there is none, or it cannot be opened."""
     if not settings.device and not dai.Device.getAllAvailableDevices():
         raise CameraError("no camera found; `steadypose doctor` says whether one is plugged in")
     return dai.Device(dai.DeviceInfo(settings.device)) if settings.device else dai.Device()
@@ -242,9 +228,7 @@ def open_device(settings: OakSettings) -> dai.Device:
 def connect(settings: OakSettings, clock: Clock, image_file: Path | None = None) -> Iterator[Host]:
     """Open the camera and run the whole pipeline on it. ``image_file`` is for the newest image, for the viewer.
 
-    Raises:
-        RuntimeError: there is no such camera, it cannot be opened, or the model cannot be downloaded. The text is
-            depthai's.
+    Raises RuntimeError if there is no such camera, it cannot be opened, or the model cannot be downloaded.
     """
     device = open_device(settings)
     with device, closing(ImageWriter(image_file)) if image_file else nullcontext() as writer:
@@ -254,11 +238,8 @@ def connect(settings: OakSettings, clock: Clock, image_file: Path | None = None)
         fps = settings.fps or usual_fps
         with dai.Pipeline(device) as pipeline:
             colour = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A, sensorFps=fps)
-            model = (
-                dai.NNArchive(Path(settings.archive))
-                if settings.archive
-                else dai.NNModelDescription(settings.model or zoo)
-            )
+            of_zoo = dai.NNModelDescription(settings.model or zoo)
+            model = dai.NNArchive(Path(settings.archive)) if settings.archive else of_zoo
             network = pipeline.create(dai.node.DetectionNetwork).build(colour, model, fps)
             network.setConfidenceThreshold(settings.confidence)
             view, depth = aligned_depth(pipeline, colour, platform)
@@ -334,8 +315,7 @@ def capture(
 ) -> Still:
     """Start a pipeline with these outputs, and capture the image that follows ``settle`` others.
 
-    Raises:
-        CameraError: no image arrives in time.
+    Raises CameraError if no image arrives in time.
     """
     pairs = _pairs(pipeline, colour=colour, depth=depth).createOutputQueue(maxSize=2)
     level = GravityEstimator()
@@ -355,11 +335,7 @@ def capture(
 
 
 def capture_with_camera(settings: OakSettings) -> Still:
-    """Capture an image of the camera that the settings name.
-
-    Raises:
-        RuntimeError: the camera cannot be opened, or gives no image.
-    """
+    """Capture an image of the camera that the settings name. Raises RuntimeError if that fails."""
     device = open_device(settings)
     with device, dai.Pipeline(device) as pipeline:
         sensor = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A, sensorFps=DEPTH_FPS)

@@ -19,11 +19,9 @@ from steadypose.nodes.sources.registry import InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, RecordedSource
 
 LEAP_NS = 15_000_000_000
-"""Step of stamps, in either direction, that counts as a clock reset instead of a pause, nanoseconds. It is not waited
-for."""
+"""Step of stamps, in either direction, that is a clock reset instead of a pause to wait for, nanoseconds."""
 LOOP_PAUSE_NS = 1_000_000_000
-"""Pause between the end of a looped recording and its restart, nanoseconds. It is long enough for every stage to drop
-its bodies."""
+"""Pause before a looped recording restarts, nanoseconds: long enough for every stage to drop its bodies."""
 
 
 class Position(NamedTuple):
@@ -58,9 +56,7 @@ class PoseInputNode(Node):
         self._source = source or open_input(launch, self.clock)
         if launch.transport.lossless and not isinstance(self._source, LiveSource):  # a camera cannot repeat its frames
             self._lag = CONTEXT
-        self._rate = settings.rate
-        self._loop = settings.loop
-        self._pose = settings.calibration.pose
+        self._rate, self._loop, self._pose = settings.rate, settings.loop, settings.calibration.pose
         self._last_ns: int | None = None
         self._at = Position()
         self._pace: Timeline | None = None  # on the monotonic clock, so that setting the wall clock has no effect
@@ -75,7 +71,6 @@ class PoseInputNode(Node):
             self._play(self._source)
 
     def _pass_on(self, source: LiveSource) -> None:
-        """Publish a live source's skeletons as they arrive."""
         with closing(source.frames()) as frames:
             for frame in frames:
                 if self.stopping:
@@ -127,14 +122,14 @@ class PoseInputNode(Node):
     def problems(self) -> list[Problem]:
         return self._source.problems() if isinstance(self._source, LiveSource) else []
 
-    def _tell_pace(self) -> None:
+    def _set_timeline(self) -> None:
         """Convert the playback timeline to wall time, which may have been set since."""
         if self._pace:
             set_ns = self.clock.now_ns() - self.clock.monotonic_ns()
             self.timeline = dataclasses.replace(self._pace, wall_ns=self._pace.wall_ns + set_ns)
 
     def status(self) -> dict[str, str]:
-        self._tell_pace()
+        self._set_timeline()
         refused = {f"refused.{cause}": str(n) for cause, n in self._source.refused.items() if n}
         camera = self._source.status() if isinstance(self._source, LiveSource) else {}
         return camera | refused | (self.timeline.values() if self.timeline else {})
@@ -166,7 +161,7 @@ class PoseInputNode(Node):
             return
         if self._pace is None or last_ns is None or abs(stamp_ns - last_ns) > LEAP_NS:
             self._pace = Timeline(stamp_ns, self.clock.monotonic_ns(), self._rate)
-            self._tell_pace()
+            self._set_timeline()
             self.report()
         due_ns = self._pace.wall(due_stamp_ns)
         while (left_ns := due_ns - self.clock.monotonic_ns()) > 0 and not self.stopping:

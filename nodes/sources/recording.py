@@ -37,26 +37,20 @@ NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 """File name suffixes of videos, in which MediaPipe detects skeletons."""
-
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
 DAMAGE = (LOST, BROKEN, UNDECODABLE)
 """Prefixes of the causes that count unreadable parts of a recording."""
 
 
 class RecordingSource:
-    """The skeletons of a recording, without end-of-stream messages.
-
-    Raises:
-        RecordingError: there is no recording, or it has no ``pose/raw``.
-    """
+    """The skeletons of a recording, without end-of-stream messages. Raises RecordingError if it has none."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         with RecordingReader(path) as recording:
             if not recording.count(POSE_RAW):
-                raise RecordingError(
-                    f"{path}: expected messages on {POSE_RAW}, got {', '.join(recording.topics)}; record that topic too"
-                )
+                got = f"{', '.join(recording.topics)}; record that topic too"
+                raise RecordingError(f"{path}: expected messages on {POSE_RAW}, got {got}")
             self.refused: Counter[str] = Counter({LOST: recording.lost_bytes})
             self._frames = recording.count(POSE_RAW)
 
@@ -78,20 +72,14 @@ class RecordingSource:
 def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file: Path | None = None) -> RecordedSource:
     """Open a recorded source: rosbag2 directory, ``.mcap``, ``.npz``, ``.csv``, motion capture file, or video.
 
-    Args:
-        path: path of the recording, or the name of a bundled stream.
-        rig: description of a motion capture file, for what the file itself lacks (`prior.mocap.files.Description`).
-        image_file: file for the newest image of a video, for the viewer.
+    ``path`` may be the name of a bundled stream. ``rig`` describes a motion capture file, for what the file itself
+    lacks (`prior.mocap.files.Description`); ``image_file`` is for the newest image of a video, for the viewer.
 
-    Raises:
-        LaunchError: there is nothing at the path, or it is a video and MediaPipe is not installed.
-        RecordingError, NpzError, CsvError, MotionError: the file contains no skeletons. All are ValueErrors that say
-            what to do.
+    Raises LaunchError if there is nothing at the path, or it is a video and MediaPipe is not installed; RecordingError,
+    NpzError, CsvError or MotionError if the file contains no skeletons. All are ValueErrors that say what to do.
     """
     if not str(path):
-        raise LaunchError(
-            f"[input] recording: expected a recording, {_FILES} or a video to play, got none; give --input"
-        )
+        raise LaunchError(f"[input] recording: expected a recording, {_FILES} or a video, got none; give --input")
     path = located(str(path), Path(), STREAMS)
     if not path.exists():
         own = PACKAGE / STREAMS / path.name
@@ -100,20 +88,16 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
             hint = hint or nearest(path.name, (p.name for p in (PACKAGE / STREAMS).iterdir() if p.is_dir()))
         raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video{hint}")
     if path.suffix.lower() in VIDEOS:
-        return _open_video(path, image_file)
+        require_extra("webcam")
+        from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
+
+        return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), image_file=image_file)
     if holds_motion(path):
         return MotionSource(path, rig)
     if path.is_file() and path.suffix not in (".npz", ".csv", ".mcap"):
         raise LaunchError(f"{path}: expected a rosbag2 directory, an .mcap, {_FILES}, or a video, got {path.suffix!r}")
     formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
     return formats.get(path.suffix, RecordingSource)(path)
-
-
-def _open_video(path: Path, image_file: Path | None) -> RecordedSource:
-    require_extra("webcam")
-    from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
-
-    return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), image_file=image_file)
 
 
 def with_end(messages: Iterable[tuple[str, Message]]) -> Iterator[tuple[str, Message]]:
@@ -175,9 +159,7 @@ class CsvSource:
         try:
             columns = [name.strip() for name in next(rows, [])]
             if not columns:
-                raise CsvError(
-                    f"{path}: has no rows: expected a header, stamp, JOINT_x, JOINT_y, JOINT_z, ..., and a row a frame"
-                )
+                raise CsvError(f"{path}: has no rows: expected a header, stamp, JOINT_x, ..., and a row for each frame")
             self._skeleton = _skeleton(path, columns, notes.get("skeleton"))
             self._frames = self._read(((numbers[rows.line_num - 1], row) for row in rows), columns)
         except csv.Error as error:
@@ -189,20 +171,15 @@ class CsvSource:
         except ValueError as error:
             raise CsvError(f"{path}: {error}") from error
         if not self._frames:
-            raise CsvError(
-                f"{path}: expected at least one row of numbers after the header, got none that can be read: "
-                f"{'; '.join(self.refused)}"
-            )
+            raise CsvError(f"{path}: expected a row of numbers after the header, got none: {'; '.join(self.refused)}")
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __iter__(self) -> Iterator[tuple[str, Message]]:
+        source, skeleton = as_text(self.path.stem), self._skeleton.name
         for stamp_ns, bodies in self._frames:
-            message = PoseRaw(
-                stamp_ns, "sensor", as_text(self.path.stem), self._skeleton.name, self._sensor_pose, False, list(bodies)
-            )
-            yield POSE_RAW, message
+            yield POSE_RAW, PoseRaw(stamp_ns, "sensor", source, skeleton, self._sensor_pose, False, list(bodies))
 
     def _read(self, rows: Iterable[tuple[int, list[str]]], columns: list[str]) -> list[tuple[int, list[RawBody]]]:
         """Stamp and bodies of each frame, in file order, from the numbers of rows in the file and their cells."""
@@ -265,24 +242,22 @@ def _id(row: int, body: float) -> int:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """The lines of a text file in UTF-8."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             for line in file:
                 if "\0" in line:  # UTF-16 without a mark at its beginning
-                    raise CsvError(
-                        f"{path}: cannot be read as text: expected UTF-8, got characters of 0; save it as UTF-8"
-                    )
+                    raise CsvError(f"{path}: cannot be read as text: got characters of 0; save it as UTF-8")
                 yield line.rstrip("\n")
-    except UnicodeDecodeError as error:
-        raise CsvError(f"{path}: cannot be read as text: {error}; save it as UTF-8") from error
-    except OSError as error:
-        raise CsvError(f"{path}: cannot be read as text: {error}") from error
+    except (UnicodeDecodeError, OSError) as error:
+        remedy = "; save it as UTF-8" if isinstance(error, UnicodeDecodeError) else ""
+        raise CsvError(f"{path}: cannot be read as text: {error}{remedy}") from error
 
 
 def _table(path: Path, numbers: list[int]) -> Iterator[str]:
-    """The lines of header and rows; their numbers in the file are appended to ``numbers``. They come one at a time,
-    because cells as text take ten times the memory of numbers."""
+    """The lines of header and rows, one at a time, because cells as text take ten times the memory of numbers.
+
+    Their numbers in the file are appended to ``numbers``.
+    """
     for number, line in enumerate(_lines(path), start=1):
         if line.strip() and not line.startswith("#"):
             numbers.append(number)
@@ -290,7 +265,6 @@ def _table(path: Path, numbers: list[int]) -> Iterator[str]:
 
 
 def _notes(path: Path) -> dict[str, str]:
-    """The values of the lines ``# KEY: VALUE``, by key."""
     notes = {}
     for line in _lines(path):
         if not line.startswith("#"):
@@ -302,21 +276,13 @@ def _notes(path: Path) -> dict[str, str]:
         elif colon and difflib.get_close_matches(key, NOTES, n=1, cutoff=0.75):
             raise CsvError(f"{path}: expected a line '# skeleton: NAME' or '# up: AXIS', got {line[:40]!r}")
         elif colon and key.isidentifier():  # a single word: meant as a setting, rather than a remark
-            logger.warning(
-                "%s: the line %r is not used: expected '# skeleton: NAME' or '# up: AXIS'; positions are read as "
-                "metres, stamps as seconds",
-                path,
-                line[:40],
-            )
+            expected = "expected '# skeleton: NAME' or '# up: AXIS'; positions are read as metres, stamps as seconds"
+            logger.warning("%s: the line %r is not used: %s", path, line[:40], expected)
     return notes
 
 
 def _check_unit(path: Path, cells: list[str]) -> None:
-    """Check that stamps are seconds. Frames up to `SLOWEST_NS` apart are a slow recording.
-
-    Raises:
-        CsvError: they are in another unit.
-    """
+    """Raise CsvError if stamps are not seconds. Frames up to `SLOWEST_NS` apart are a slow recording."""
     stamps = []
     for cell in cells:
         with suppress(ValueError):  # of an empty cell, or text: its row is refused
@@ -332,19 +298,16 @@ def _check_unit(path: Path, cells: list[str]) -> None:
     if not fits and latest >= LATEST_S:
         fits = [unit for unit, factor in UNITS.items() if latest / factor < LATEST_S]
     if fits:
-        first = ", ".join(f"{value:.15g}" for value in np.unique(seconds)[:3])
-        raise CsvError(
-            f"{path}: stamp: expected seconds, got {first}: these look like {fits[0]}; divide by {UNITS[fits[0]]}"
-        )
+        got = ", ".join(f"{value:.15g}" for value in np.unique(seconds)[:3])
+        remedy = f"these look like {fits[0]}; divide by {UNITS[fits[0]]}"
+        raise CsvError(f"{path}: stamp: expected seconds, got {got}: {remedy}")
 
 
 def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
     """The layout that has all joints of the header."""
     if len(columns) == 1 and (separators := [character for character in ";\t" if character in columns[0]]):
-        raise CsvError(
-            f"{path}: expected columns separated by commas, got {separators[0]!r} in {columns[0][:40]!r} ...; save it "
-            "with commas, and with points in numbers (0.183)"
-        )
+        got = f"got {separators[0]!r} in {columns[0][:40]!r} ...; save it with commas, and points in numbers (0.183)"
+        raise CsvError(f"{path}: expected columns separated by commas, {got}")
     if "stamp" not in columns:
         raise CsvError(
             f"{path}: expected a header with a column 'stamp', in seconds; got {', '.join(columns[:8]) or 'none'} ...; "
@@ -356,10 +319,8 @@ def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
     joints = {name[:-2] for name in columns if name.endswith(tuple(f"_{axis}" for axis in AXES))}
     lone = [f"{joint}_{axis}" for joint in sorted(joints) for axis in AXES if f"{joint}_{axis}" not in columns]
     if not joints or lone:
-        raise CsvError(
-            f"{path}: expected columns JOINT_x, JOINT_y and JOINT_z for each joint; "
-            f"{'missing: ' + ', '.join(lone[:5]) if lone else 'got none among ' + ', '.join(columns[:8])}"
-        )
+        got = f"missing: {', '.join(lone[:5])}" if lone else f"got none among {', '.join(columns[:8])}"
+        raise CsvError(f"{path}: expected columns JOINT_x, JOINT_y and JOINT_z for each joint; {got}")
     if named is not None and named not in SKELETONS:
         raise CsvError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {named!r}")
     for skeleton in [SKELETONS[named]] if named else SKELETONS.values():
@@ -371,14 +332,11 @@ def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
         key=lambda s: (len(spelt & {_plain(joint) for joint in s.joints}), len(joints & set(s.joints))),
     )
     names = {_plain(joint): joint for joint in closest.joints}
-    strange = [
-        joint + (f" ({names[_plain(joint)]})" if _plain(joint) in names else "")
-        for joint in sorted(joints - set(closest.joints))
-    ]
-    raise CsvError(
-        f"{path}: expected the joints of one skeleton; {closest.name} is closest, but has no {', '.join(strange[:5])}"
-        + ("; rename them to the names in brackets" if any(joint.endswith(")") for joint in strange[:5]) else "")
-    )
+    strange = {joint: names.get(_plain(joint)) for joint in sorted(joints - set(closest.joints))[:5]}
+    listed = ", ".join(f"{joint} ({name})" if name else joint for joint, name in strange.items())
+    remedy = "; rename them to the names in brackets" if any(strange.values()) else ""
+    expected = "expected the joints of one skeleton"
+    raise CsvError(f"{path}: {expected}; {closest.name} is closest, but has no {listed}{remedy}")
 
 
 def _plain(joint: str) -> str:

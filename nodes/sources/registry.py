@@ -60,11 +60,8 @@ class InputSettings:
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES and ":" not in self.source:
-            *others, last = SOURCES
-            raise LaunchError(
-                f"[input] source: expected {', '.join(others)} or {last}, got {self.source!r}"
-                f"{nearest(self.source, SOURCES)}"
-            )
+            got = f"{self.source!r}{nearest(self.source, SOURCES)}"
+            raise LaunchError(f"[input] source: expected one of {', '.join(SOURCES)}, got {got}")
         if not 0 <= self.rate < math.inf:
             raise LaunchError(f"[input] rate: expected 0 (as fast as possible) or more, got {self.rate:g}")
 
@@ -76,15 +73,13 @@ SOURCES: Mapping[str, tuple[Callable[[Any, SourceContext], RecordedSource | Live
     "ros2": (Ros2Source, ""),
     "merge": (MergeSource, ""),
 }
-"""Of each source, what creates it from its settings, and the extra in `nodes.extras.EXTRAS` that it needs, if any. A
-camera is opened only when its frames are requested."""
+"""What creates each source from its settings, and the extra that it needs, if any. Cameras are opened later."""
 
 
 def open_input(launch: Launch, clock: Clock | None = None) -> RecordedSource | LiveSource:
     """Open the source that ``[input]`` of a launch file names, for a node with this ``clock``.
 
-    Raises:
-        LaunchError, RecordingError, NpzError, CsvError: a setting or the recording cannot be used.
+    Raises LaunchError, RecordingError, NpzError or CsvError if a setting or the recording cannot be used.
     """
     settings, transport, clock = launch.settings(InputSettings), launch.transport, clock or Clock()
     if ":" in settings.source:

@@ -75,21 +75,15 @@ class TransformBuffer:
             del moments[: bisect_left(moments, moments[-1][0] - CACHE_NS, key=_stamp)]
 
     def lookup(self, target: str, source: str, at_ns: int) -> tuple[Floats, Floats]:
-        """The pose of the frame ``source`` in the frame ``target`` at a time.
+        """The pose of the frame ``source`` in the frame ``target`` at a time: (3,) metres, and (4,) xyzw.
 
-        Returns:
-            Position (3,) metres and quaternion (4,) xyzw.
-
-        Raises:
-            TransformError: the frames are not connected, or no transform is known at that time.
+        Raises TransformError if the frames are not connected, or no transform is known at that time.
         """
         up, down = self._path(source), self._path(target)
         shared = next((frame for frame in up if frame in down), None)
         if shared is None:
             known = ", ".join(sorted({*self._parents, *self._parents.values()})) or "none"
-            raise TransformError(
-                f"no path from {source!r} to {target!r} in TF: expected one tree; frames heard of: {known}"
-            )
+            raise TransformError(f"no path from {source!r} to {target!r} in TF: expected one tree; frames: {known}")
         place, turned = self._chain(up[: up.index(shared)], at_ns)
         other, back = self._chain(down[: down.index(shared)], at_ns)
         inverse = back.inv()
@@ -156,7 +150,7 @@ class TfSettings:
 class TfSource(LiveSource):
     """A live source whose messages get their sensor pose from TF at their stamp.
 
-    A message whose transform does not arrive in time is dropped and counted, because its sensor pose is unknown.
+    A message whose transform does not arrive in time is dropped and counted.
     """
 
     def __init__(
@@ -209,14 +203,11 @@ class TfSource(LiveSource):
     def problems(self) -> list[Problem]:
         found = self._source.problems()
         if self._trouble:
-            found.append(
-                error(
-                    "tf",
-                    f"{self._trouble}; expected the sensor's frame in {self._settings.fixed_frame!r} at each stamp: "
-                    "is the robot's TF published, in this ROS_DOMAIN_ID, with clocks that agree? [input.tf] names the "
-                    "frames",
-                )
+            text = (
+                f"{self._trouble}; expected the sensor's frame in {self._settings.fixed_frame!r} at each stamp: is the "
+                "robot's TF published, in this ROS_DOMAIN_ID, with clocks that agree? [input.tf] names the frames"
             )
+            found.append(error("tf", text))
         return found
 
     def status(self) -> dict[str, str]:
@@ -239,7 +230,7 @@ class Ros2Settings:
     """the axis of a PoseArray's frame that points up: z, y or -y"""
 
     def __post_init__(self) -> None:
-        if self.type not in ("MarkerArray", "PoseArray"):
+        if self.type not in TYPES:
             raise LaunchError(f"[input.ros2] type: expected MarkerArray or PoseArray, got {self.type!r}")
         if self.up not in ("z", "y", "-y"):
             raise LaunchError(f"[input.ros2] up: expected z, y or -y, got {self.up!r}")
@@ -251,11 +242,9 @@ class Ros2Source(LiveSource):
     def __init__(self, settings: Ros2Settings, context: SourceContext) -> None:
         super().__init__()
         check_ros()
-        if settings.skeleton not in SKELETONS:
-            raise LaunchError(
-                f"[input.ros2] skeleton: expected one of {', '.join(SKELETONS)}, got {settings.skeleton!r}"
-                f"{nearest(settings.skeleton, SKELETONS)}"
-            )
+        if (name := settings.skeleton) not in SKELETONS:
+            got = f"{name!r}{nearest(name, SKELETONS)}"
+            raise LaunchError(f"[input.ros2] skeleton: expected one of {', '.join(SKELETONS)}, got {got}")
         self._settings = settings
         self._queue: deque[PoseRaw] = deque()
         self._received = 0
@@ -294,13 +283,9 @@ class Ros2Source(LiveSource):
         if self._wrong:
             return [warning("ros_message", f"{self._settings.topic}: {self._wrong}")]
         if not self._received:
-            return [
-                warning(
-                    "ros_silent",
-                    f"no message on {self._settings.topic} yet: expected a {TYPES[self._settings.type]}; check `ros2 "
-                    "topic list -t`, and that ROS_DOMAIN_ID is the same there and here",
-                )
-            ]
+            expected = f"expected a {TYPES[self._settings.type]}"
+            remedy = "check `ros2 topic list -t`, and that ROS_DOMAIN_ID is the same there and here"
+            return [warning("ros_silent", f"no message on {self._settings.topic} yet: {expected}; {remedy}")]
         return []
 
     def status(self) -> dict[str, str]:

@@ -46,9 +46,8 @@ class CalibrationSettings:
             values = getattr(self, name)
             numbers = all(isinstance(v, int | float) and math.isfinite(v) for v in values)
             if values and not (numbers and len(values) in allowed):
-                raise LaunchError(
-                    f"[input.calibration] {name}: expected {' or '.join(map(str, allowed))} numbers, got {values}"
-                )
+                expected = " or ".join(map(str, allowed))
+                raise LaunchError(f"[input.calibration] {name}: expected {expected} numbers, got {values}")
         if bool(self.position) != bool(self.orientation):
             raise LaunchError("[input.calibration] expected position and orientation, or neither")
         if self.orientation and abs(math.hypot(*self.orientation) - 1.0) > 0.01:
@@ -64,10 +63,8 @@ class CalibrationSettings:
         return Pose(np.array(self.position), np.array(self.orientation)) if self.position else None
 
 
-MODEL = (
-    "https://storage.googleapis.com/mediapipe-models/pose_landmarker/pose_landmarker_full/float16/latest/"
-    "pose_landmarker_full.task"
-)
+_SITE = "https://storage.googleapis.com/mediapipe-models"
+MODEL = f"{_SITE}/pose_landmarker/pose_landmarker_full/float16/latest/pose_landmarker_full.task"
 
 
 @dataclass(frozen=True)

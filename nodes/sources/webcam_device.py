@@ -23,17 +23,17 @@ from steadypose.nodes.sources.adapters import from_mediapipe, pinhole
 from steadypose.nodes.sources.image import ImageWriter
 from steadypose.nodes.sources.source import MODEL, CalibrationSettings, CameraError, WebcamSettings, count_failure
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET: what cannot be read is said by ourselves
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET: what cannot be read is reported here
 
 Landmarker = Callable[[NDArray[Any], int], Any]
 """Function from an RGB image (H, W, 3) and its time in increasing milliseconds to a ``PoseLandmarkerResult``."""
 
 
 class Lens:
-    """Undistorts a webcam's images of ``size`` (width and height, pixels), with calibrated intrinsics, scaled to images
-    of that size, or intrinsics guessed from the horizontal field of view (radians).
+    """Undistorts a webcam's images of ``size`` (width and height, pixels).
 
-    Raises LaunchError if the calibration is for another aspect ratio.
+    The intrinsics are calibrated ones, scaled to images of that size, or guessed from the horizontal field of view
+    (radians). Raises LaunchError if the calibration is for another aspect ratio.
     """
 
     def __init__(self, size: tuple[int, int], field_of_view: float, calibration: CalibrationSettings) -> None:
@@ -43,18 +43,15 @@ class Lens:
         if calibration.size:
             scale = np.array(size) / calibration.size
             if abs(scale[0] / scale[1] - 1.0) > 0.01:  # cropped to an unknown part of the lens's view
-                width, height = calibration.size
-                raise LaunchError(
-                    f"[input.calibration] size: the lens was calibrated for images of {width} x {height}, the camera "
-                    f"gives {size[0]} x {size[1]}; calibrate it with images of that size"
-                )
+                expected, got = ("{} x {}".format(*size) for size in (calibration.size, size))
+                remedy = "calibrate it with images of that size"
+                raise LaunchError(f"[input.calibration] size: expected images of {expected}, got {got}; {remedy}")
             self.intrinsics[[0, 1], [0, 1]] = calibration.focal * scale
             self.intrinsics[:2, 2] = (np.array(calibration.centre) + 0.5) * scale - 0.5
             distortion = np.array(calibration.distortion)
             if distortion.any():
-                self._maps = cv2.initUndistortRectifyMap(
-                    self.intrinsics, distortion, np.eye(3), self.intrinsics, size, cv2.CV_16SC2
-                )
+                lens = self.intrinsics
+                self._maps = cv2.initUndistortRectifyMap(lens, distortion, np.eye(3), lens, size, cv2.CV_16SC2)
 
     def undistort(self, image: NDArray[Any]) -> NDArray[Any]:
         """Undistort an image (H, W, 3)."""
@@ -62,11 +59,7 @@ class Lens:
 
 
 class PoseFinder:
-    """Detects bodies in the images of one camera, given in the order of time.
-
-    Attributes:
-        counts: number of failed images, by cause.
-    """
+    """Detects bodies in the images of one camera, in the order of time; ``counts`` counts failed images, by cause."""
 
     def __init__(
         self,
@@ -136,8 +129,7 @@ class Webcam:
 def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
     """MediaPipe's pose landmarker in video mode, with the configured model or the built-in one.
 
-    Raises:
-        LaunchError: the model cannot be used, or MediaPipe has no built-in one.
+    Raises LaunchError if the model cannot be used, or MediaPipe has no built-in one.
     """
     with ExitStack() as stack:
         with _silent():
@@ -153,9 +145,7 @@ def mediapipe_landmarker(settings: WebcamSettings) -> Iterator[Landmarker]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Discard what libraries write to standard error: MediaPipe logs at its start and at the first image, and has no
-    setting for it. Exceptions pass.
-    """
+    """Discard what libraries write to standard error: MediaPipe logs at its start and at the first image."""
     kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nothing, 2)
@@ -174,10 +164,8 @@ def _own_landmarker() -> Iterator[Landmarker]:
     except ModuleNotFoundError as error:
         if error.name == "mediapipe":
             raise
-        raise LaunchError(
-            f"[input.webcam] model: this MediaPipe comes without one (0.10 does, for Python up to 3.12); download one, "
-            f"such as {MODEL}"
-        ) from error
+        without = "this MediaPipe comes without one (0.10 has one, for Python up to 3.12)"
+        raise LaunchError(f"[input.webcam] model: {without}; download one, such as {MODEL}") from error
 
     def alone(landmarks: Any) -> list[Any]:
         return [] if landmarks is None else [landmarks.landmark]
@@ -206,9 +194,7 @@ def _landmarker_of(settings: WebcamSettings) -> Iterator[Landmarker]:
     try:
         found = vision.PoseLandmarker.create_from_options(options)
     except (OSError, ValueError, RuntimeError) as error:
-        raise LaunchError(
-            f"[input.webcam] model: MediaPipe cannot use {settings.model} as a pose landmarker: {error}"
-        ) from error
+        raise LaunchError(f"[input.webcam] model: MediaPipe cannot use {settings.model}: {error}") from error
     with found:
         yield lambda image, milliseconds: found.detect_for_video(
             mediapipe.Image(image_format=mediapipe.ImageFormat.SRGB, data=image), milliseconds
@@ -223,12 +209,7 @@ def connect(
     make_landmarker: Callable[[WebcamSettings], AbstractContextManager[Landmarker]] = mediapipe_landmarker,
     image_file: Path | None = None,
 ) -> Iterator[Webcam]:
-    """Open the camera and the landmarker.
-
-    Raises:
-        CameraError: the camera cannot be opened now.
-        LaunchError: the landmarker's model cannot be used.
-    """
+    """Open the camera and the landmarker. Raises CameraError or LaunchError if camera or model cannot be used."""
     capture = cv2.VideoCapture(settings.camera)
     try:
         if not capture.isOpened():
@@ -258,11 +239,7 @@ def stamped_images(video: cv2.VideoCapture) -> Iterator[tuple[int, NDArray[Any] 
 
 
 class VideoSource:
-    """The skeletons that MediaPipe detects in a video. As a recorded source it processes every image.
-
-    Raises:
-        LaunchError: the video cannot be opened.
-    """
+    """The skeletons that MediaPipe detects in every image of a video. Raises LaunchError if it cannot be opened."""
 
     def __init__(
         self,

@@ -126,7 +126,7 @@ def test_remarks_are_no_settings_and_what_seems_one_is_warned_of(tmp_path: Path,
     (["# skeleton: smpl22", NOSE], "smpl22 is closest, but has no nose"),
     (["# up: x", NOSE, "0,1,2,3"], "up: expected one of"),
     ([NOSE], "has a header, but no rows"),
-    ([NOSE, "a,b,c,d"], "at least one row.*row 2, column stamp: 'a'"),
+    ([NOSE, "a,b,c,d"], "expected a row of numbers.*row 2, column stamp: 'a'"),
     ([NOSE, "0,1,2," + "3" * 200_000], "cannot be read as CSV: field larger"),
 ])  # fmt: skip
 def test_a_csv_that_is_not_poses_says_what_was_expected(tmp_path: Path, lines: list[str], expected: str) -> None:

@@ -237,7 +237,7 @@ def test_what_is_no_skeleton_is_counted_and_the_next_frame_comes(walk: list[Mome
 
 
 def test_an_archive_that_is_not_there_and_a_camera_that_gives_nothing_say_so(tmp_path: Path, monkeypatch) -> None:
-    with pytest.raises(LaunchError, match=r"archive: expected a file that is an NN archive"):
+    with pytest.raises(LaunchError, match=r"archive: expected an NN archive"):
         open_oak(OakSettings(archive=str(tmp_path / "none.tar.xz")), CONTEXT)
     monkeypatch.setattr(oak_device, "PAIR_TIMEOUT_S", 0.01)
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
