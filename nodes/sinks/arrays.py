@@ -25,7 +25,6 @@ from steadypose.nodes.timeline import TimedEvent
 
 SLACK_NS = 1_000_000
 """Time short of a period for which a row is held, nanoseconds: a period away, where there is a body, is another row."""
-
 _ROW = np.dtype(
     [
         ("stamp_ns", np.int64),
@@ -83,9 +82,8 @@ class NpzCollector:
         tracks = [_at(np.stack(rows), stamps_ns) if rows else blank for rows in self._rows.values()]
         table = np.stack(tracks, axis=1) if tracks else _blank((len(stamps_ns), 1))
         several = self._axis or len(tracks) > 1
-        arrays: dict[str, NDArray[Any]] = {
-            name: table[name] if several else table[name][:, 0] for name in _ROW.names or () if name != "stamp_ns"
-        }
+        shown = table if several else table[:, 0]
+        arrays: dict[str, NDArray[Any]] = {name: shown[name] for name in _ROW.names or () if name != "stamp_ns"}
         arrays |= {"stamp_ns": stamps_ns, "joint_names": np.array(JOINTS)}
         return arrays | {"body_id": np.array(list(self._rows), np.int32)} if several else arrays
 
@@ -181,9 +179,8 @@ def write_events(path: Path, events: Iterable[TimedEvent]) -> None:
     """Write events as CSV: a row each, with its begin and end in seconds."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["body", "event", "hand", "begin", "end", "confidence", *(f"direction_{axis}" for axis in "xyz")]
-        )
+        direction = [f"direction_{axis}" for axis in "xyz"]
+        writer.writerow(["body", "event", "hand", "begin", "end", "confidence", *direction])
         for event in events:
             hand = event.hand.name if event.hand else ""
             times = [_seconds(event.begin_ns), _seconds(event.end_ns)]

@@ -43,9 +43,7 @@ class DatagramSettings:
 
 
 class Followed:
-    """Selects one person to follow until they are gone, then the next; or only ``body``. ``id`` is None until there was
-    anybody.
-    """
+    """Selects one person (or only ``body``) to follow until they are gone, then the next; ``id`` is None at first."""
 
     def __init__(self, body: int | None = None) -> None:
         self.id = self._only = body
@@ -111,13 +109,10 @@ class VmcSettings(DatagramSettings):
 
 
 def unity(body: WorldBody) -> tuple[Floats, Floats]:
-    """Each bone's position and rotation in its parent's frame, in Unity's axes: x right, y up, z forward.
+    """Each bone's position (22, 3) metres and rotation (22, 4) xyzw in its parent's frame, the hips' in the world.
 
-    Unity's axes are left-handed, so positions are mirrored, and the sense of rotations is reversed. A person who faces
-    the camera looks along z.
-
-    Returns:
-        (22, 3) metres, the hips in the world; and (22, 4) xyzw.
+    The axes are Unity's: x right, y up, z forward. They are left-handed, so positions are mirrored, and the sense of
+    rotations is reversed. A person who faces the camera looks along z.
     """
     rotations = np.array(body.rotations, dtype=np.float64)
     world = global_rotations(rotation_matrices(rotations))

@@ -28,7 +28,6 @@ DARK, ON_DARK = "#12141a", ("#56b4e9", "#f08c2e", "#d7dbe4")
 """Colours of a dark background, and of left, right and middle on it."""
 FAINT = 0.3
 """Opacity of unobserved joints and bones."""
-
 CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
 """(8,) canonical joints of the contact probabilities in ``pose/world``."""
 
@@ -52,8 +51,6 @@ def bones(observable: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 ALL_BONES: NDArray[np.intp] = bones(np.ones(len(JOINTS), dtype=bool))
 """(21, 2) parent and child of each canonical bone."""
-
-
 SIDES: NDArray[np.intp] = np.array([0 if "left" in name else 1 if "right" in name else 2 for name in JOINTS])
 """(22,) side of each canonical joint: 0 left, 1 right, 2 middle."""
 

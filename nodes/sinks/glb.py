@@ -10,34 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pygltflib as gltf
 from numpy.typing import NDArray
-from pygltflib import (
-    ARRAY_BUFFER,
-    ELEMENT_ARRAY_BUFFER,
-    FLOAT,
-    GLTF2,
-    UNSIGNED_BYTE,
-    UNSIGNED_SHORT,
-    Accessor,
-    Animation,
-    AnimationChannel,
-    AnimationChannelTarget,
-    AnimationSampler,
-    Attributes,
-    Buffer,
-    BufferView,
-    Mesh,
-    Node,
-    Primitive,
-    Scene,
-    Skin,
-)
 
 from steadypose.nodes.sinks.motion_files import Y_UP, BodyMotion
 from steadypose.prior.body.skeleton import CHILDREN, JOINTS, PARENTS, VRM
 
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_KINDS = {np.dtype(np.float32): FLOAT, np.dtype(np.uint16): UNSIGNED_SHORT, np.dtype(np.uint8): UNSIGNED_BYTE}
+_KINDS = {np.float32: gltf.FLOAT, np.uint16: gltf.UNSIGNED_SHORT, np.uint8: gltf.UNSIGNED_BYTE}
 
 WAIST, WIDTH = 0.2, 0.08
 """Position of a bone's widest point, and its half width there, relative to the bone's length; as in Blender."""
@@ -64,33 +44,32 @@ def _file(motion: BodyMotion, names: Sequence[str], at_rest: bool) -> bytes:
     start = np.tile([0.0, 0.0, 0.0, 1.0], (22, 1)) if at_rest else turns[0]
     place = np.array([0.0, -rest[:, 1].min(), 0.0]) if at_rest else root[0]
     nodes = [
-        Node(name=name, translation=at.tolist(), rotation=turn.tolist(), children=list(children))
+        gltf.Node(name=name, translation=at.tolist(), rotation=turn.tolist(), children=list(children))
         for name, at, turn, children in zip(names, [place, *offsets[1:]], start, CHILDREN, strict=True)
     ]  # fmt: skip
     bind = np.tile(np.eye(4), (22, 1, 1))
     bind[:, :3, 3] = -rest
     points, triangles, joints = _octahedra(rest)
-    attributes = Attributes(
-        POSITION=file.add(points, ARRAY_BUFFER),
-        JOINTS_0=file.add(np.pad(joints[:, None], ((0, 0), (0, 3))).astype(np.uint8), ARRAY_BUFFER),
-        WEIGHTS_0=file.add(np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), ARRAY_BUFFER),
+    attributes = gltf.Attributes(
+        POSITION=file.add(points, gltf.ARRAY_BUFFER),
+        JOINTS_0=file.add(np.pad(joints[:, None], ((0, 0), (0, 3))).astype(np.uint8), gltf.ARRAY_BUFFER),
+        WEIGHTS_0=file.add(np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), gltf.ARRAY_BUFFER),
     )
-    mesh = Mesh(primitives=[Primitive(attributes=attributes, indices=file.add(triangles, ELEMENT_ARRAY_BUFFER))])
-    skin = Skin(joints=list(range(22)), inverseBindMatrices=file.add(bind.swapaxes(1, 2).reshape(22, 16)), skeleton=0)
+    corners = file.add(triangles, gltf.ELEMENT_ARRAY_BUFFER)
+    mesh = gltf.Mesh(primitives=[gltf.Primitive(attributes=attributes, indices=corners)])
+    inverse = file.add(bind.swapaxes(1, 2).reshape(22, 16))
+    skin = gltf.Skin(joints=list(range(22)), inverseBindMatrices=inverse, skeleton=0)
     times = file.add((np.arange(len(root)) / motion.fps)[:, None])
     tracks = [(0, "translation", file.add(root)), *((j, "rotation", file.add(turns[:, j])) for j in range(22))]
-    animation = Animation(
+    targets = [gltf.AnimationChannelTarget(node=joint, path=path) for joint, path, _ in tracks]
+    animation = gltf.Animation(
         name="motion",
-        samplers=[AnimationSampler(input=times, output=values) for _, _, values in tracks],
-        channels=[
-            AnimationChannel(sampler=k, target=AnimationChannelTarget(node=joint, path=path))
-            for k, (joint, path, _) in enumerate(tracks)
-        ],
+        samplers=[gltf.AnimationSampler(input=times, output=values) for _, _, values in tracks],
+        channels=[gltf.AnimationChannel(sampler=k, target=target) for k, target in enumerate(targets)],
     )
-    result = GLTF2(
-        scene=0, scenes=[Scene(nodes=[0, 22])], nodes=[*nodes, Node(name="body", mesh=0, skin=0)], meshes=[mesh],
-        skins=[skin], animations=[animation],
-    )  # fmt: skip
+    nodes.append(gltf.Node(name="body", mesh=0, skin=0))
+    scene = gltf.Scene(nodes=[0, 22])
+    result = gltf.GLTF2(scene=0, scenes=[scene], nodes=nodes, meshes=[mesh], skins=[skin], animations=[animation])
     if at_rest:
         bones = {name: {"node": joint} for joint, name in enumerate(names)}
         result.extensionsUsed = ["VRMC_vrm_animation"]
@@ -102,21 +81,21 @@ class _Glb:
     """The buffer of a file, with its views and accessors."""
 
     def __init__(self) -> None:
-        self._views: list[BufferView] = []
-        self._accessors: list[Accessor] = []
+        self._views: list[gltf.BufferView] = []
+        self._accessors: list[gltf.Accessor] = []
         self._data = bytearray()
 
     def add(self, values: NDArray[np.generic], target: int | None = None) -> int:
         """Add an array (N, width). Returns its accessor; floats are stored as float32."""
-        values = values if values.dtype in _KINDS else values.astype(np.float32)
+        values = values if values.dtype.type in _KINDS else values.astype(np.float32)
         self._data += bytes(-len(self._data) % 4)
-        view = BufferView(buffer=0, byteOffset=len(self._data), byteLength=values.nbytes, target=target)
+        view = gltf.BufferView(buffer=0, byteOffset=len(self._data), byteLength=values.nbytes, target=target)
         self._data += values.tobytes()
         self._views.append(view)
         self._accessors.append(
-            Accessor(
+            gltf.Accessor(
                 bufferView=len(self._views) - 1,
-                componentType=_KINDS[values.dtype],
+                componentType=_KINDS[values.dtype.type],
                 count=len(values),
                 type=_TYPES[values.shape[1]],
                 min=values.min(axis=0).tolist(),
@@ -125,9 +104,9 @@ class _Glb:
         )
         return len(self._accessors) - 1
 
-    def finish(self, file: GLTF2) -> bytes:
+    def finish(self, file: gltf.GLTF2) -> bytes:
         file.bufferViews, file.accessors = self._views, self._accessors
-        file.buffers = [Buffer(byteLength=len(self._data))]
+        file.buffers = [gltf.Buffer(byteLength=len(self._data))]
         file.set_binary_blob(bytes(self._data))
         return b"".join(file.save_to_bytes())
 

@@ -60,16 +60,10 @@ class BodyMotion:
 
 
 def read_motion(path: Path, body: int | None = None) -> BodyMotion:
-    """Read one body's motion from the output of ``steadypose clean``.
+    """Read the motion of one body (``body``: its id; None: that present the longest) from an output of ``steadypose
+    clean``.
 
-    Its frame rate is that of the stamps. Gaps are interpolated.
-
-    Args:
-        path: a recording with ``pose/world``, or an ``.npz``.
-        body: the body's id; default: the one present the longest.
-
-    Raises:
-        ExportError: there is no such motion.
+    Its frame rate is that of the stamps. Gaps are interpolated. Raises ExportError if there is no such motion.
     """
     stamps, positions, rotations = _from_npz(path, body) if path.suffix == ".npz" else _from_recording(path, body)
     known = np.isfinite(positions).all(axis=(1, 2)) & np.isfinite(rotations).all(axis=(1, 2))
@@ -77,10 +71,8 @@ def read_motion(path: Path, body: int | None = None) -> BodyMotion:
         raise ExportError(f"{path}: expected a body in two frames at least, got {known.sum()}; was anybody recognised?")
     stamps = stamps[known]
     if (back := np.flatnonzero(np.diff(stamps) <= 0)).size:
-        raise ExportError(
-            f"{path}: expected increasing stamps, got {stamps[back[0] + 1]:.9f} s after {stamps[back[0]]:.9f} s; sort "
-            "the input by stamp, without repeated ones, and clean it again"
-        )
+        got = f"{stamps[back[0] + 1]:.9f} s after {stamps[back[0]]:.9f} s"
+        raise ExportError(f"{path}: expected increasing stamps, got {got}; sort the input by stamp, and clean it again")
     return steady(stamps, positions[known], rotations[known])
 
 
@@ -132,10 +124,8 @@ def _bones(positions: Floats, rotations: Floats) -> Floats:
 def _from_recording(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
     with RecordingReader(path) as recording:
         if not recording.count(POSE_WORLD):
-            raise ExportError(
-                f"{path}: expected messages on {POSE_WORLD}, got {', '.join(recording.topics)}; clean it first: "
-                f"steadypose clean {path} OUT"
-            )
+            got = ", ".join(recording.topics)
+            raise ExportError(f"{path}: expected {POSE_WORLD}, got {got}; clean it first: steadypose clean {path} OUT")
         frames = [m for _, _, m in recording.messages([POSE_WORLD]) if isinstance(m, PoseWorld)]
     bodies = Counter(b.id for frame in frames for b in frame.bodies)
     chosen = _chosen(path, bodies, body)
@@ -153,10 +143,8 @@ RIGID = [J[name] for name in JOINTS if not name.endswith(("pelvis", "hip", "knee
 def _from_npz(path: Path, body: int | None) -> tuple[Floats, Floats, Floats]:
     arrays = read_arrays(path)
     if missing := {"positions", "world_positions", "rotations"} - arrays.keys():
-        raise ExportError(
-            f"{path}: expected what 'steadypose clean' writes, it lacks {', '.join(sorted(missing))}; clean it first: "
-            f"steadypose clean {path} OUT.npz"
-        )
+        lacks = ", ".join(sorted(missing))
+        raise ExportError(f"{path}: has no {lacks}; clean it first: steadypose clean {path} OUT.npz")
     seen, world, turned = (arrays[n].astype(np.float64) for n in ("positions", "world_positions", "rotations"))
     if "body_id" in arrays:
         ids = arrays["body_id"].tolist()
@@ -214,8 +202,7 @@ def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
             write(child, depth + 1)
         if not CHILDREN[joint]:
             name = JOINTS[joint]
-            end = ENDS.get(name, ENDS.get(name.partition("_")[2]))
-            assert end is not None, "head, wrists and feet are all there is without children"
+            end = ENDS["foot" if name.endswith("foot") else name]
             lines.extend("\t" * (depth + 1) + row for row in ("End Site", "{", f"\tOFFSET {_row(np.array(end))}", "}"))
         lines.append("\t" * depth + "}")
 
@@ -230,9 +217,6 @@ def to_bvh(motion: BodyMotion, names: Sequence[str] = JOINTS) -> bytes:
 
 def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.6f}" for value in values)
-
-
-MILLIMETRES = 1000.0
 
 
 def to_csv(motion: BodyMotion) -> bytes:
@@ -252,14 +236,12 @@ def to_csv(motion: BodyMotion) -> bytes:
 
 def to_trc(motion: BodyMotion) -> bytes:
     """The content of a TRC file with markers at the joints: millimetres, y up."""
-    rows = (MILLIMETRES * motion.ahead().positions @ Y_UP.T).reshape(len(motion.root), -1)
+    rows = (1000.0 * motion.ahead().positions @ Y_UP.T).reshape(len(motion.root), -1)
     frames, rate = len(rows), f"{motion.fps:g}"
-    header = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame",
-              "OrigNumFrames")  # fmt: skip
     lines = [
         "PathFileType\t4\t(X/Y/Z)\tsteadypose.trc",
-        "\t".join(header),
-        "\t".join([rate, rate, str(frames), str(len(JOINTS)), "mm", rate, "1", str(frames)]),
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate}\t{rate}\t{frames}\t{len(JOINTS)}\tmm\t{rate}\t1\t{frames}",
         "Frame#\tTime\t" + "\t\t\t".join(JOINTS) + "\t\t",
         "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(JOINTS)) for axis in "XYZ"),
         "",

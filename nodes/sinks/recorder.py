@@ -67,23 +67,17 @@ class RecorderSettings:
     def __post_init__(self) -> None:
         for topic in self.topics:
             if topic not in TOPICS:
-                raise LaunchError(
-                    f"[recorder] topics names {topic!r}, which nobody publishes{nearest(topic, TOPICS)}; "
-                    f"topics are {', '.join(TOPICS)}"
-                )
+                got = f"{topic!r}{nearest(topic, TOPICS)}"
+                raise LaunchError(f"[recorder] topics: expected of {', '.join(TOPICS)}, got {got}")
         for name in ("split_mb", "split_s", "keep_mb", "free_mb", "sync_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise LaunchError(f"[recorder] {name}: expected 0 or more, got {getattr(self, name)}")
-        if 0 < self.keep_mb < 2 * self.split_mb:
-            raise LaunchError(
-                f"[recorder] keep_mb: expected two parts or more, {2 * self.split_mb:g}, got {self.keep_mb:g}"
-            )
+        if 0 < self.keep_mb < (least := 2 * self.split_mb):
+            raise LaunchError(f"[recorder] keep_mb: expected two parts or more, {least:g}, got {self.keep_mb:g}")
 
     def writer(self) -> RecordingWriter:
-        """Open the recording for writing.
-
-        Raises:
-            RecordingError: the directory contains something else, or cannot be created.
+        """Open the recording for writing. Raises RecordingError if the directory holds something else, or cannot be
+        made.
         """
         return RecordingWriter(
             self.directory,
@@ -95,32 +89,27 @@ class RecorderSettings:
 
 
 def check_recorder(launch: Launch) -> None:
-    """Check the settings. Raises LaunchError if no directory is set."""
+    """Raise LaunchError if no directory is set, or a setting cannot be used."""
     if not launch.settings(RecorderSettings).directory:
         raise LaunchError("[recorder] directory: expected the recording to make, got none; give --record")
 
 
 def free_directory(launch: Launch) -> Path | None:
-    """The directory to record to instead of the configured one; None if the configured one can be used.
+    """The directory to record to instead of the configured one; None if that can be used. Raises as `open_input`.
 
     A restarted live run continues the same recording with its next part, because stamps increase and limits apply to
     the whole recording. A replay would repeat the same stamps, so it gets a new directory. So does a run whose
     directory contains something else.
-
-    Raises:
-        LaunchError, RecordingError, NpzError, CsvError: the source that the launch starts cannot be opened.
     """
     directory = launch.settings(RecorderSettings).directory
     wanted = Path(directory)
-    if not directory or not os.path.lexists(wanted) or (_is_recording(wanted) and not _replays(launch)):
+    if not directory or not os.path.lexists(wanted):
+        return None
+    replays = "pose_input" in launch.nodes and not isinstance(open_input(launch), LiveSource)
+    if _is_recording(wanted) and not replays:
         return None
     others = (wanted.with_name(f"{wanted.name}-{number}") for number in itertools.count(2))
     return next(other for other in others if not os.path.lexists(other))
-
-
-def _replays(launch: Launch) -> bool:
-    own = "pose_input" in launch.nodes
-    return own and not isinstance(open_input(launch), LiveSource)
 
 
 def _is_recording(directory: Path) -> bool:
@@ -167,12 +156,10 @@ class RecorderNode(Node):
 
     def __init__(self, launch: Launch, clock: Clock | None = None) -> None:
         super().__init__(launch, clock)
-        settings = launch.settings(RecorderSettings)
         check_recorder(launch)
-        self._settings = settings
+        self._settings = launch.settings(RecorderSettings)
         self._full = False
         self._checked_ns = self._synced_ns = 0
-        self._topics = frozenset(settings.topics)
         self._log_times = LogTimes()
         self._before_first_pose: deque[Diagnostics] = deque(maxlen=WAITING)
         self._pose_ns: int | None = None
@@ -217,7 +204,7 @@ class RecorderNode(Node):
         return False if self._writer and self._writer.pending else super().settle(timeout_s)
 
     def handle(self, topic: str, message: Message) -> None:
-        if topic not in self._topics:
+        if topic not in self._settings.topics:
             return
         if isinstance(message, Diagnostics) and self._pose_ns is None:
             # the stream's time is unknown before the first pose

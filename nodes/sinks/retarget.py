@@ -56,7 +56,7 @@ class RetargetSettings(DatagramSettings):
 
 
 def check_retarget(launch: Launch) -> None:
-    """Check that the robot's URDF can be used. Raises LaunchError if no URDF is set, or it cannot be used."""
+    """Raise LaunchError if no URDF is set, or it cannot be used."""
     settings = launch.settings(RetargetSettings)
     if not settings.urdf:
         raise LaunchError("[retarget] urdf: expected the robot's URDF file, got none")
@@ -143,15 +143,14 @@ class Retargeter:
         self._scale, self._floor = 1.0, 0.0
 
     def reset(self) -> None:
-        """Forget the person, so that the next one is started afresh."""
+        """Forget the person."""
         self._stamp_ns = None
         self._solver.velocity[:] = 0.0
         self._lift()
 
     def follow(self, stamp_ns: int, body: WorldBody, floor: float = 0.0) -> RobotPose | None:
-        """The robot's pose for a person's at ``stamp_ns``; None if that is unknown, or not later than the last.
-
-        ``floor`` is the height of the person's floor, metres.
+        """The robot's pose for a person's at ``stamp_ns``, on a floor at height ``floor``, metres; None if that is
+        unknown, or not later than the last.
         """
         if not np.isfinite(body.positions).all() or not np.isfinite(body.rotations).all():
             return None
@@ -201,7 +200,6 @@ class Retargeter:
         self._began_ns = stamp_ns
 
     def _aim(self, body: WorldBody, dt: float, *, begun: bool) -> None:
-        """Set the targets of all links."""
         solver, p = self._solver, body.positions.astype(np.float64)
         turns = global_rotations(rotation_matrices(body.rotations.astype(np.float64)))
         hips = 0.5 * (p[J["left_hip"]] + p[J["right_hip"]])

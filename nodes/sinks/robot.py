@@ -64,8 +64,7 @@ class Robot:
 def load_robot(path: Path, links: Mapping[str, str]) -> Robot:
     """Read a URDF; ``links`` are those of the parts whose link's name does not show it.
 
-    Raises:
-        LaunchError: the file cannot be read, a joint has no limits, or no link is found for a part.
+    Raises LaunchError if the file cannot be read, a joint has no limits, or no link is found for a part.
     """
     import mujoco
 
@@ -107,9 +106,8 @@ def _limits(root: ET.Element, path: Path) -> dict[str, tuple[float, float, float
         except ValueError as error:
             raise LaunchError(f"{path}: joint {name}: {error}") from error
         if not (low < high and speed > 0):
-            raise LaunchError(
-                f"{path}: joint {name}: expected lower < upper and velocity > 0, got {low:g}, {high:g}, {speed:g}"
-            )
+            got = f"{low:g}, {high:g}, {speed:g}"
+            raise LaunchError(f"{path}: joint {name}: expected lower < upper and velocity > 0, got {got}")
         found[name] = low, high, speed
     return found
 
@@ -119,21 +117,17 @@ def _prepare(root: ET.Element) -> None:
     for parent in [root, *root]:
         for element in [child for child in parent if child.tag in _SHAPES]:
             parent.remove(element)
-    settings = ET.SubElement(root, "mujoco")
     # kinematics need no masses, so a link without one must not make MuJoCo refuse the robot
-    ET.SubElement(
-        settings, "compiler", fusestatic="false", balanceinertia="true", boundmass="0.01", boundinertia="0.0001"
-    )
+    mass = {"balanceinertia": "true", "boundmass": "0.01", "boundinertia": "0.0001"}
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", mass, fusestatic="false")
 
 
 def _links(path: Path, bodies: list[str], base: str, given: Mapping[str, str]) -> dict[str, str]:
     """The link of each part. ``bodies`` are ordered with parents first."""
     if unknown := given.keys() - set(PARTS):
         raise LaunchError(f"links: no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
-    found = {
-        "pelvis": base,
-        "torso": next((b for b in reversed(bodies) if re.search("torso|chest|trunk", b, re.I)), ""),
-    }
+    torso = next((b for b in reversed(bodies) if re.search("torso|chest|trunk", b, re.I)), "")
+    found = {"pelvis": base, "torso": torso}
     for side, sided in _SIDES.items():
         own = [body for body in bodies if re.search(sided, body)]
         for part, pattern in _PARTS.items():
@@ -142,8 +136,7 @@ def _links(path: Path, bodies: list[str], base: str, given: Mapping[str, str]) -
     found |= given
     for part, link in found.items():
         if link not in bodies:
-            raise LaunchError(
-                f"{path}: {f'no link {link!r}' if link else 'no link is named'} for {part}: "
-                f'with links = {{ {part} = "LINK" }}, name one of {", ".join(bodies[2:])}'
-            )
+            missing = f"no link {link!r}" if link else "no link is named"
+            remedy = f'with links = {{ {part} = "LINK" }}, name one of {", ".join(bodies[2:])}'
+            raise LaunchError(f"{path}: {missing} for {part}: {remedy}")
     return found

@@ -57,14 +57,10 @@ class Foot:
         self._stood, self._free = 0.0, 1.0
 
     def target(self, turn: Floats, place: Floats, touching: float, now: tuple[Floats, Floats], dt: float) -> Target:
-        """Where the foot should be.
+        """Where the foot should be, ``dt`` seconds after the last frame.
 
-        Args:
-            turn: (3, 3) rotation that the person's foot gives the link.
-            place: (3,) position that the person's foot gives the link.
-            touching: probability that the person's foot stands.
-            now: the link's rotation (3, 3) and position (3,).
-            dt: seconds since the last frame.
+        ``turn`` (3, 3) and ``place`` (3,) are the link's rotation and position as the person's foot has them,
+        ``touching`` is the probability that it stands, and ``now`` are the link's rotation and position.
         """
         heading = _heading(turn @ self._rest.T)
         far = self._spot is not None and self._far(self._spot[1], heading, place)

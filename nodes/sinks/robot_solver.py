@@ -94,9 +94,8 @@ class Solver:
         return data.xmat[k].reshape(3, 3).copy(), data.xpos[k].copy()
 
     def aim(self, part: str, turn: Floats | None, place: Floats, costs: tuple[float, float] | None = None) -> None:
-        """Set the target of a part: rotation (3, 3), unless only its place counts, and position (3,), world.
-
-        ``costs``, if any, replace those of the part from now on.
+        """Set the target of a part: rotation (3, 3), unless only its place counts, and position (3,), world; and its
+        ``costs``.
         """
         import mujoco
 

@@ -60,7 +60,4 @@ def in_url(host: str) -> str:
 def port_taken(section: str, host: str, port: int, error: Exception) -> str:
     """The error text for a port that cannot be opened."""
     cause = error.strerror if isinstance(error, OSError) else error
-    return (
-        f"[{section}] port {port} at {host} is not to be had ({cause}): another one may be running; close it, "
-        f"or set another [{section}] port"
-    )
+    return f"[{section}] port {port} at {host} cannot be opened ({cause}): close what uses it, or set another port"

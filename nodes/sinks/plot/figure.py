@@ -32,19 +32,13 @@ if TYPE_CHECKING:
 
     from steadypose.prior.complete.stream import Completion
 
-
-STRIP = 2.8
-TITLE = 0.45
+STRIP, TITLE = 2.8, 0.45
 """Heights of the strip of stick figures and of a panel's title, inches."""
-PICTURES = (".png", ".svg", ".pdf")
+IMAGES = (".png", ".svg", ".pdf")
 
 
-def check_picture(output: Path, endings: tuple[str, ...] = PICTURES) -> None:
-    """Check the name of an output file.
-
-    Raises:
-        PlotError: its suffix is not one of ``endings``, or its folder does not exist.
-    """
+def check_image(output: Path, endings: tuple[str, ...] = IMAGES) -> None:
+    """Raise PlotError if an output's suffix is not one of ``endings``, or its folder does not exist."""
     if output.suffix not in endings:
         raise PlotError(f"output: expected a name ending in {', '.join(endings[:-1])} or {endings[-1]}, got {output}")
     if not output.resolve().parent.is_dir():
@@ -52,8 +46,8 @@ def check_picture(output: Path, endings: tuple[str, ...] = PICTURES) -> None:
 
 
 def save(figure: Figure, output: Path) -> None:
-    """Write a figure to a file; raises as `check_picture`."""
-    check_picture(output)
+    """Write a figure to a file; raises as `check_image`."""
+    check_image(output)
     figure.savefig(output, dpi=110)
 
 
@@ -67,9 +61,8 @@ def draw(history: History, body: int | None = None) -> Figure:
     heights = [panel.height + TITLE for panel in panels]
     body_height = max(sum(heights), 9.0)
     figure = Figure(figsize=(16, STRIP + body_height), layout="constrained")
-    figure.suptitle(
-        f"{as_text(history.name)} · {history.origin} · body {chosen}, one of {len(bodies)}", fontsize=14, weight="bold"
-    )
+    title = f"{as_text(history.name)} · {history.origin} · body {chosen}, one of {len(bodies)}"
+    figure.suptitle(title, fontsize=14, weight="bold")
     rows = figure.add_gridspec(2, 1, height_ratios=[STRIP, body_height])
     draw_stick_figures(figure.add_subplot(rows[0]), history, chosen)
     columns = rows[1].subgridspec(1, 2, width_ratios=[2.2, 1])
@@ -105,9 +98,8 @@ def draw_completion(completion: Completion, title: str) -> Figure:
     joints, known = completed.positions, completed.known
     there = np.flatnonzero(np.isfinite(joints).all(axis=(1, 2)))
     figure = Figure(figsize=(15, 9), layout="constrained")
-    figure.suptitle(
-        f"{as_text(title)} · body {stretch.body} · given in green, completed in orange", fontsize=13, weight="bold"
-    )
+    title = f"{as_text(title)} · body {stretch.body} · given in green, completed in orange"
+    figure.suptitle(title, fontsize=13, weight="bold")
     grid = figure.add_gridspec(2, 2, height_ratios=[1, 1.2], width_ratios=[2.2, 1])
     sticks = figure.add_subplot(grid[0, :])
     chosen = there[np.linspace(0, len(there) - 1, min(FIGURES, len(there))).round().astype(int)]

@@ -79,20 +79,12 @@ class History:
 
 
 def history_of_arrays(arrays: Arrays, name: str = "arrays") -> History:
-    """The history of an output of ``clean``, ``complete`` or ``fit`` given as arrays; or of an input.
-
-    Raises:
-        NpzError: the arrays are neither an output nor an input.
-    """
+    """The history of an output of ``clean``, ``complete`` or ``fit``, or of an input. Raises NpzError if neither."""
     return _of_output(name, arrays) if is_output(arrays) else _of_source(name, ArraySource(Path(name), arrays))
 
 
 def history_of_path(path: Path) -> History:
-    """The history of a recording, or of a file of poses.
-
-    Raises:
-        RecordingError, or as `open_recording`: the path cannot be read.
-    """
+    """The history of a recording, or of a file of poses. Raises RecordingError, or as `open_recording`."""
     if path.suffix == ".npz" and path.exists():
         return history_of_arrays(read_arrays(path), path.name)
     if not path.is_dir() and path.suffix != ".mcap":
@@ -116,10 +108,8 @@ def _of_output(name: str, arrays: Arrays) -> History:
 
         there = ~np.isnan(of_body("world_positions")).all(axis=(1, 2))
         if there.any():
-            joints, state, sigma, anomaly, flag, contacts = (
-                of_body(key)[there]
-                for key in ("world_positions", "state", "sigma", "anomaly", "anomaly_flag", "contacts")
-            )
+            keys = ("world_positions", "state", "sigma", "anomaly", "anomaly_flag", "contacts")
+            joints, state, sigma, anomaly, flag, contacts = (of_body(key)[there] for key in keys)
             raw, tracking = np.full_like(joints, np.nan), np.zeros(len(joints), np.uint8)
             track = Track(time[there], joints, raw, state, sigma, anomaly, flag, contacts, tracking)
             for topic in history.stamps:
@@ -159,8 +149,8 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
         for body, row in _rows(message, time):
             rows.setdefault((topic, body), []).append(row)
     history.stamps = {topic: np.array(times) for topic, times in stamps.items()}
-    for (topic, body), found in rows.items():
-        track = Track(*(np.array(column) for column in zip(*found, strict=True)))
+    for (topic, body), of_body in rows.items():
+        track = Track(*(np.array(column) for column in zip(*of_body, strict=True)))
         history.tracks.setdefault(topic, {})[body] = track
     if observable.any():
         history.observable = observable
@@ -168,10 +158,9 @@ def gather(name: str, messages: Iterable[tuple[str, int, Message]], start_ns: in
     names = {"source": sources, "skeleton": skeletons}
     history.origin = " · ".join(f"{what} {', '.join(found)}" for what, found in names.items() if found)
     for node, values in dropped_or_refused.items():
-        counts = {key: value for key, value in values.items() if key.startswith(("dropped.", "refused."))}
-        history.dropped_or_refused.update(
-            {f"{node} {key}": int(value) for key, value in counts.items() if value.isdecimal()}
-        )
+        for key, value in values.items():
+            if key.startswith(("dropped.", "refused.")) and value.isdecimal():
+                history.dropped_or_refused[f"{node} {key}"] += int(value)
     return history
 
 
@@ -229,7 +218,7 @@ def errors_of(history: History, body: int) -> dict[str, TrackError]:
 
 
 def _distances(track: Track, truth: Track, *, placed: bool) -> NDArray[np.float64]:
-    """(T, 22) distances between a track's joints and the ground truth at the same times, metres; NaN where missing.
+    """(T, 22) distances from the ground truth at the same times, metres; NaN where missing.
 
     A track that is not ``placed`` in the world is first aligned to the truth.
     """
@@ -265,15 +254,9 @@ class PlotError(ValueError):
 
 
 def body_of(history: History, body: int | None) -> int:
-    """The body to draw: the requested one, or the one observed the longest.
-
-    Raises:
-        PlotError: there are no bodies, or not the requested one.
-    """
+    """The body to draw: the requested one, or the one observed the longest. Raises PlotError if there is none."""
     if not history.tracks:
-        raise PlotError(
-            f"{history.name}: expected at least one body, found none; `steadypose info` shows what it contains"
-        )
+        raise PlotError(f"{history.name}: expected at least one body, got none; see `steadypose info`")
     if body is None:
         tracks = next(history.tracks[t] for t in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH) if t in history.tracks)
         return max(tracks, key=lambda body: len(tracks[body].time))

@@ -45,12 +45,10 @@ class Body(NamedTuple):
 def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[NDArray[np.uint8]], float]:
     """RGB images (H, W, 3) of a cleaned video with its skeletons, and their frame rate in Hz.
 
-    The camera model is that of `steadypose clean VIDEO`, with a guessed field of view.
-
-    Raises:
-        PlotError: the video cannot be read, or does not belong to the recording.
+    The camera's field of view is guessed, as by `steadypose clean VIDEO`. Raises PlotError if the video cannot be read,
+    or is not the recording's.
     """
-    whose = f"expected what 'steadypose clean {video} OUT' makes"
+    expected = f"{recording}: expected what 'steadypose clean {video} OUT' makes"
     moments = _of_npz(recording, body) if recording.suffix == ".npz" else _of_recording(recording, body)
     capture = cv2.VideoCapture(str(video))
     size = (int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
@@ -60,13 +58,11 @@ def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[N
     lens = pinhole(size, WebcamSettings().field_of_view)
     pixels = [_pixels(body.clean, lens) for bodies in moments.values() for body in bodies]
     if not any(((at > 0.0) & (at < size)).all(axis=-1).any() for at in pixels):
-        raise PlotError(f"{recording}: {whose}: poses as its camera sees them; none of these lies within its images")
+        raise PlotError(f"{expected}, got poses of which none lies within its images")
     length_ns = capture.get(cv2.CAP_PROP_FRAME_COUNT) / rate * 1e9
     if 0 < length_ns < min(moments) - APART_NS:
-        raise PlotError(
-            f"{recording}: {whose}: stamps that count from its start; the video ends after {length_ns / 1e9:.1f} s, "
-            f"these begin at {min(moments) / 1e9:.1f} s"
-        )
+        ends = f"the video ends after {length_ns / 1e9:.1f} s"
+        raise PlotError(f"{expected}, but {ends}, and these stamps begin at {min(moments) / 1e9:.1f} s")
     step = max(round(rate / FPS), 1)
     return _frames(capture, moments, lens, step), rate / step
 

@@ -31,16 +31,10 @@ from steadypose.prior.body.skeleton import J
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 GAP_S = 0.2
 """Longest gap that a plotted line bridges, seconds."""
 JOINTS_SHOWN = 3
-TOPIC_COLOURS = {
-    POSE_TRUTH: TRUTH_COLOUR,
-    POSE_RAW: RAW_COLOUR,
-    POSE_CLEAN: CLEAN_COLOUR,
-    POSE_WORLD: WORLD_COLOUR,
-}
+TOPIC_COLOURS = {POSE_TRUTH: TRUTH_COLOUR, POSE_RAW: RAW_COLOUR, POSE_CLEAN: CLEAN_COLOUR, POSE_WORLD: WORLD_COLOUR}
 AXIS_COLOURS = {"x": "#882255", "y": "#44aa99", "z": "#332288"}
 
 
@@ -56,9 +50,8 @@ def panels_over_time(history: History, body: int, errors: dict[str, TrackError])
     panels: list[Panel] = []
     if clean is not None:
         for joint in busiest_joints(clean):
-            panels.append(
-                Panel(f"{JOINTS[joint]} relative to the pelvis, m", 1.25, lambda ax, j=joint: _draw_joint(ax, clean, j))
-            )
+            title = f"{JOINTS[joint]} relative to the pelvis, m"
+            panels.append(Panel(title, 1.25, lambda ax, j=joint: _draw_joint(ax, clean, j)))
         panels.append(Panel("state of each joint", 3.0, lambda ax: _draw_states(ax, clean)))
         panels.append(Panel("standard deviation, cm", 0.8, lambda ax: _draw_sigma(ax, clean)))
         if np.isfinite(clean.anomaly).any():
@@ -70,13 +63,7 @@ def panels_over_time(history: History, body: int, errors: dict[str, TrackError])
     if world is not None:
         panels.append(Panel("contacts", 1.0, lambda ax: draw_contacts(ax, world)))
     if errors:
-        panels.append(
-            Panel(
-                "position error, cm, mean over joints",
-                1.25,
-                lambda ax: _draw_errors(ax, errors),
-            )
-        )
+        panels.append(Panel("position error, cm, mean over joints", 1.25, lambda ax: _draw_errors(ax, errors)))
     panels.append(Panel("interval between frames, ms", 1.0, lambda ax: _draw_intervals(ax, history)))
     return panels
 
@@ -97,10 +84,7 @@ def corrections(clean: Track) -> NDArray[np.float64]:
 def with_gaps(time: NDArray[np.float64], *columns: NDArray) -> list[NDArray]:
     """Time and columns with a NaN inserted in each longer gap, so that no line bridges it."""
     gaps = np.flatnonzero(np.diff(time) > GAP_S) + 1
-    return [
-        np.insert(time, gaps, np.nan),
-        *(np.insert(column.astype(float), gaps, np.nan, axis=0) for column in columns),
-    ]
+    return [np.insert(column.astype(float), gaps, np.nan, axis=0) for column in (time, *columns)]
 
 
 def _draw_joint(ax: Axes, clean: Track, joint: int) -> None:
@@ -143,10 +127,8 @@ def _draw_cells(ax: Axes, time: NDArray[np.float64], cells: NDArray[np.uint8], c
     hole = np.isnan(time)
     time[hole] = time[np.flatnonzero(hole) - 1] + 1 / 30
     edges = np.append(time, time[-1] + 1 / 30)
-    palette = ListedColormap(list(colours.values()))
-    ax.pcolormesh(
-        edges, np.arange(values.shape[1] + 1) - 0.5, values.T, cmap=palette, vmin=-0.5, vmax=len(colours) - 0.5
-    )
+    palette, rows = ListedColormap(list(colours.values())), np.arange(values.shape[1] + 1) - 0.5
+    ax.pcolormesh(edges, rows, values.T, cmap=palette, vmin=-0.5, vmax=len(colours) - 0.5)
     ax.invert_yaxis()
     handles = [Patch(color=colour, label=label) for label, colour in colours.items()]
     ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(handles), fontsize=7, frameon=False)
@@ -202,9 +184,8 @@ def _draw_intervals(ax: Axes, history: History) -> None:
     for topic, colour in TOPIC_COLOURS.items():
         stamps = history.stamps.get(topic, np.zeros(0))
         if len(stamps) > 1:
-            ax.plot(
-                stamps[1:], np.diff(stamps) * 1e3, ".", color=colour, markersize=3, label=topic.removeprefix("pose/")
-            )
+            label = topic.removeprefix("pose/")
+            ax.plot(stamps[1:], np.diff(stamps) * 1e3, ".", color=colour, markersize=3, label=label)
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="upper right", ncols=3, fontsize=7, markerscale=3)
     ax.set_yscale("log")
@@ -224,11 +205,8 @@ def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
     from matplotlib.lines import Line2D
 
     clean = history.track(POSE_CLEAN, body)
-    topic, track = next(
-        (topic, t)
-        for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH)
-        if (t := history.track(topic, body)) is not None
-    )
+    found = ((topic, history.track(topic, body)) for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW, POSE_TRUTH))
+    topic, track = next((topic, track) for topic, track in found if track is not None)
     lines = {topic.removeprefix("pose/"): RAW_COLOUR}
     if clean is not None:
         lines = {"raw": RAW_COLOUR} if np.isfinite(clean.raw).any() else {}
@@ -251,22 +229,14 @@ def draw_stick_figures(ax: Axes, history: History, body: int) -> None:
 
 
 def side_by_side(ax: Axes, seconds: Floats, joints: Floats, *others: Floats) -> list[Floats]:
-    """Arrange N figures in a row, seen from the front, and label each with its time.
+    """Arrange N figures, joints (N, 22, 3) metres, world, in a row, seen from the front, labelled with their times.
 
-    Args:
-        ax: the axes to draw in.
-        seconds: (N,) time of each figure, seconds.
-        joints: (N, 22, 3) metres, world.
-        others: further joints (N, 22, 3) of the same figures, arranged at the same places.
-
-    Returns:
-        (N, 22, 2) coordinates in the axes for ``joints`` and for each of ``others``.
+    Returns coordinates (N, 22, 2) in the axes for ``joints``, and for each of ``others``, which share their places.
     """
     front = next((f for points in joints if (f := facing(points)) is not None), np.array([1.0, 0.0, 0.0]))
     across = np.array([-front[1], front[0], 0.0])
     pelvis = joints[:, :1]
     pelvis = np.where(np.isfinite(pelvis).all(axis=-1, keepdims=True), pelvis, nan_mean(joints, axis=1)[:, None])
-    places = np.arange(len(joints))
     for place, second in enumerate(seconds):
         ax.text(place, -1.27, f"{second:.1f} s", ha="center", fontsize=8)
     ax.set(aspect="equal", xlim=(-0.6, max(FIGURES, len(joints)) - 0.4), ylim=(-1.34, 0.85))
@@ -288,10 +258,9 @@ def draw_bones(
     lines = points[pairs]
     shown = np.flatnonzero(np.isfinite(lines).all(axis=(1, 2)))
     picked = colours if isinstance(colours, str) else [colours[bone] for bone in shown]
-    opacity = alpha if np.isscalar(alpha) else [alpha[bone] for bone in shown]
-    ax.add_collection(
-        LineCollection(list(lines[shown]), colors=picked, linewidths=width, alpha=opacity, capstyle="round")
-    )
+    alpha = alpha if np.isscalar(alpha) else [alpha[bone] for bone in shown]
+    drawn = LineCollection(list(lines[shown]), colors=picked, linewidths=width, alpha=alpha, capstyle="round")
+    ax.add_collection(drawn)
 
 
 def draw_path(ax: Axes, history: History, body: int) -> None:
@@ -354,10 +323,9 @@ def draw_summary(ax: Axes, history: History, body: int, errors: dict[str, TrackE
         if len(stamps) > 1:
             steps = np.diff(stamps)
             usual = np.median(steps)
-            gaps = int((steps > GAP_RATIO * usual).sum())
+            gaps = f"gaps: {(steps > GAP_RATIO * usual).sum()}, longest {steps.max() * 1e3:.0f} ms"
             rate = 1 / usual if usual > 0 else np.nan
-            longest = f"longest {steps.max() * 1e3:.0f} ms"
-            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz, gaps: {gaps}, {longest}")
+            lines.append(f"{topic:<10} {len(stamps):>5} frames {rate:5.1f} Hz, {gaps}")
     clean = history.track(POSE_CLEAN, body)
     if clean is not None:
         shares = [f"{state.name.lower()} {(clean.state == state).mean():.1%}" for state in JointState]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import OBSERVED
@@ -54,10 +55,9 @@ SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
 
 
 def write_overlay(recording: Path, video: Path, path: Path, body: int | None = None) -> int:
-    """Write a video's cleaned skeletons over its images, in the format of the suffix. Returns the number of frames.
+    """Write a video's cleaned skeletons over its images, in the format of the suffix; returns the number of frames.
 
-    Raises:
-        PlotError: OpenCV is not installed, or as in `overlay.overlaid`.
+    Raises PlotError if OpenCV is not installed, or as `overlay.overlaid`.
     """
     try:
         from steadypose.nodes.sinks.plot.overlay import overlaid
@@ -68,10 +68,9 @@ def write_overlay(recording: Path, video: Path, path: Path, body: int | None = N
 
 
 def write_video(history: History, path: Path, body: int | None = None) -> int:
-    """Write the video of one body at about `FPS`, in the format of the suffix. Returns the number of frames.
+    """Write the video of one body at about `FPS`, in the format of the suffix; returns the number of frames.
 
-    Raises:
-        PlotError: there is nothing to draw, no such body, or OpenCV is not installed, for an .mp4.
+    Raises PlotError if there is nothing to draw, no such body or, for an .mp4, OpenCV is not installed.
     """
     chosen = body_of(history, body)
     lead = next(t for topic in (POSE_CLEAN, POSE_WORLD, POSE_RAW) if (t := history.track(topic, chosen)) is not None)
@@ -125,15 +124,13 @@ def _frames(history: History, body: int, lead: Track, step: int) -> Iterator[NDA
     canvas = FigureCanvasAgg(figure)
     states = clean is not None or world is not None
     faint = Line2D([], [], color=MIDDLE_COLOUR, lw=3, alpha=FAINT, label="faint: not observed")
-    figure.legend(
-        handles=[
-            Line2D([], [], color=LEFT_COLOUR, lw=3, label="left"),
-            Line2D([], [], color=RIGHT_COLOUR, lw=3, label="right"),
-            *([faint] if states else []),
-            *([Line2D([], [], color=CONTACT_COLOUR, marker="o", lw=0, label="contact")] if world is not None else []),
-        ],
-        loc="lower center", ncols=4, frameon=False, fontsize=9, borderaxespad=0.1,
-    )  # fmt: skip
+    handles = [
+        Line2D([], [], color=c, lw=3, label=side) for side, c in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))
+    ]
+    handles += [faint] if states else []
+    if world is not None:
+        handles.append(Line2D([], [], color=CONTACT_COLOUR, marker="o", lw=0, label="contact"))
+    figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=9, borderaxespad=0.1)
     for row in range(0, len(lead.time), step):
         for ax, draw in zip(axes, draws.values(), strict=True):
             ax.clear()
@@ -189,7 +186,6 @@ def _stage(world: Track, at: NDArray[np.intp], view: Floats) -> Callable[[Axes, 
 
 
 def _raw(ax: Axes, view: Floats, clean: Track, row: int, shown: NDArray[np.intp]) -> None:
-    """Draw the input over the output."""
     draw_bones(ax, clean.positions[row] @ view, ALL_BONES, GHOST, width=2.0)
     draw_bones(ax, clean.raw[row] @ view, shown, _sides(shown), width=3.0)
 
@@ -213,8 +209,7 @@ def _smooth(path: Floats, frames: int = 15) -> Floats:
     for axis in range(path.shape[1]):
         known = np.isfinite(path[:, axis])
         filled[:, axis] = np.interp(rows, rows[known], path[known, axis]) if known.any() else 0.0
-    padded = np.pad(filled, ((frames // 2, frames // 2), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, np.full(frames, 1 / frames), "valid") for column in padded.T], axis=1)
+    return uniform_filter1d(filled, frames, axis=0, mode="nearest")
 
 
 def _palette() -> list[int]:

@@ -31,8 +31,6 @@ GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
 """Topics outside any namespace, by ROS's convention."""
 SILENT_NS = 5_000_000_000
 """Time without a message after which the bodies of a source are removed, nanoseconds."""
-
-
 HOST = "127.0.0.1"
 """Address to serve at: this machine only, because poses are personal data. From another machine, use
 ``ssh -L 8765:localhost:8765 robot``."""
@@ -56,9 +54,7 @@ class Ros2BridgeSettings:
         if not self.world_frame or self.world_frame.startswith("/"):
             raise LaunchError(f"[ros2] world_frame: expected a frame's name without a slash, got {self.world_frame!r}")
         if self.namespace and not _NAMESPACE.fullmatch(self.namespace):
-            raise LaunchError(
-                f"[ros2] namespace: expected a name such as robot or fleet/robot1, got {self.namespace!r}"
-            )
+            raise LaunchError(f"[ros2] namespace: expected such as robot or fleet/robot1, got {self.namespace!r}")
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ class FoxgloveSettings:
 
 
 def check_ros2(launch: Launch) -> None:
-    """Check that ROS 2's topics can be reached. Raises LaunchError as `check_ros`."""
+    """Raise LaunchError if ROS 2's topics cannot be reached."""
     check_ros()
 
 
@@ -107,9 +103,9 @@ class RosOutput:
 
 
 class FoxgloveOutput:
-    """A WebSocket server with a channel per topic, created with the topic's first message.
+    """A WebSocket server with a channel per topic, created with its first message.
 
-    The server itself keeps no messages. A latched message is sent again to all subscribers when a client subscribes.
+    The server keeps no messages: a latched one is sent again to all subscribers when a client subscribes.
     """
 
     def __init__(self, port: int) -> None:
@@ -118,11 +114,11 @@ class FoxgloveOutput:
 
         self._channels: dict[str, Any] = {}
         self._latched: dict[str, bytes] = {}
-        output = self
+        repeat = self._repeat
 
         class Latch(ServerListener):
             def on_subscribe(self, client: Any, channel: Any) -> None:
-                output.repeat(channel.topic)
+                repeat(channel.topic.removeprefix("/"))
 
         self._context = foxglove.Context()
         try:
@@ -149,9 +145,7 @@ class FoxgloveOutput:
             self._latched[topic] = cdr
         self._channels[topic].log(cdr)
 
-    def repeat(self, channel: str) -> None:
-        """Send a channel's latched message again, if there is one."""
-        topic = channel.removeprefix("/")
+    def _repeat(self, topic: str) -> None:
         if topic in self._latched:
             self._channels[topic].log(self._latched[topic])
 
@@ -194,17 +188,12 @@ class Ros2BridgeNode(RosMessagesNode):
     def work(self) -> None:
         from steadypose.nodes.sinks.ros2.messages import BodyTopics  # not needed to read a launch file; so below
 
-        self._settings = self.launch.settings(Ros2BridgeSettings)
-        connection = connect("steadypose_bridge", self._settings.namespace)
+        self._settings = s = self.launch.settings(Ros2BridgeSettings)
+        connection, several = connect("steadypose_bridge", s.namespace), bool(self.launch.server.clients)
         try:
-            self._output = RosOutput(connection, self._settings.namespace)
-            self._topics = BodyTopics(
-                self._output,
-                self._settings.world_frame,
-                sensor_tf=self._settings.sensor_tf,
-                several=bool(self.launch.server.clients),
-            )
-            print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {self._settings.world_frame}", flush=True)
+            self._output = RosOutput(connection, s.namespace)
+            self._topics = BodyTopics(self._output, s.world_frame, sensor_tf=s.sensor_tf, several=several)
+            print(f"RViz: rviz2 -d {RVIZ.resolve()} -f {s.world_frame}", flush=True)
             super().work()
         finally:
             connection.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -50,14 +50,12 @@ COLOURS: Mapping[int, Any] = {
 }
 
 
-def is_finite(body: WorldBody) -> bool:
-    """Whether a body can be published."""
-    return bool(np.isfinite(body.positions).all() and (np.abs(np.linalg.norm(body.rotations, axis=1) - 1) < 0.1).all())
-
-
 def pose_array(world: PoseWorld, bodies: Mapping[str, WorldBody]) -> Any:
     """``geometry_msgs/PoseArray`` with the 22 joints of one body after another."""
-    poses = [pose for body in bodies.values() for pose in _joint_poses(body)]
+    poses = []
+    for body in bodies.values():
+        turns = Rotation.from_matrix(joint_rotations(body)).as_quat()
+        poses += [_pose(place, turn) for place, turn in zip(body.positions, turns, strict=True)]
     return new("geometry_msgs/msg/PoseArray", header=header(world.stamp_ns, world.frame_id), poses=poses)
 
 
@@ -98,26 +96,19 @@ def body_transforms(world: PoseWorld, name: str, links: Links) -> list[Any]:
     origins[others] = (origins[others] - root) @ heading
     turns[others] = heading.T @ turns[others]
     quaternions = Rotation.from_matrix(turns).as_quat()
+    parents = [world.frame_id if link == "body" else f"body_{name}" for link in links]
     return [
-        transform(
-            world.stamp_ns, world.frame_id if link == "body" else f"body_{name}", f"{link}_{name}", origin, quaternion
-        )
-        for link, origin, quaternion in zip(links, origins, quaternions, strict=True)
+        transform(world.stamp_ns, parent, f"{link}_{name}", origin, quaternion)
+        for parent, link, origin, quaternion in zip(parents, links, origins, quaternions, strict=True)
     ]
 
 
 def transform(stamp_ns: int, parent: str, child: str, place: np.ndarray, quaternion: np.ndarray) -> Any:
     """``geometry_msgs/TransformStamped``."""
-    return new(
-        "geometry_msgs/msg/TransformStamped",
-        header=header(stamp_ns, parent),
-        child_frame_id=child,
-        transform=new(
-            "geometry_msgs/msg/Transform",
-            translation=_geometry("Vector3", place),
-            rotation=_geometry("Quaternion", quaternion),
-        ),
-    )
+    translation, rotation = _geometry("Vector3", place), _geometry("Quaternion", quaternion)
+    moved = new("geometry_msgs/msg/Transform", translation=translation, rotation=rotation)
+    stamped = header(stamp_ns, parent)
+    return new("geometry_msgs/msg/TransformStamped", header=stamped, child_frame_id=child, transform=moved)
 
 
 def tf_message(transforms: list[Any]) -> Any:
@@ -145,12 +136,6 @@ def _geometry(kind: str, values: Iterable[float]) -> Any:
 def _pose(place: np.ndarray, quaternion: np.ndarray) -> Any:
     position, orientation = _geometry("Point", place), _geometry("Quaternion", quaternion)
     return new("geometry_msgs/msg/Pose", position=position, orientation=orientation)
-
-
-def _joint_poses(body: WorldBody) -> Iterator[Any]:
-    """Poses of the 22 canonical joints in the world."""
-    turns = Rotation.from_matrix(joint_rotations(body)).as_quat()
-    return (_pose(place, turn) for place, turn in zip(body.positions, turns, strict=True))
 
 
 def _marks(where: Any, name: str, body: WorldBody) -> list[Any]:
@@ -190,8 +175,12 @@ def names_of(world: PoseWorld, source: str) -> tuple[dict[str, WorldBody], int]:
     """A message's publishable bodies by ROS name, and the number of tracked bodies that are not finite. ``source`` is
     a part of the names, unless empty."""
     followed = [body for body in world.bodies if body.tracking != Tracking.LOST]
-    found = {body_name(body.id, source): body for body in followed if is_finite(body)}
-    return found, len(followed) - len(found)
+    finite = [
+        body
+        for body in followed
+        if np.isfinite(body.positions).all() and (abs(np.linalg.norm(body.rotations, axis=1) - 1) < 0.1).all()
+    ]
+    return {body_name(body.id, source): body for body in finite}, len(followed) - len(finite)
 
 
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
@@ -213,13 +202,10 @@ class Output(Protocol):
 
 
 class BodyTopics:
-    """Sends steadypose's messages to ROS topics.
+    """Sends steadypose's messages to ROS topics of ``output``, with the frame ``world_frame`` for the world.
 
-    Args:
-        output: the receiver of the topics.
-        world_frame: frame of the world.
-        sensor_tf: whether to send the pose of a calibrated sensor.
-        several: whether there are several sources, each with ids of its own: names of bodies then contain the source.
+    ``sensor_tf`` says whether to send the pose of a calibrated sensor; ``several``, whether there are several sources,
+    each with ids of its own: names of bodies then contain the source.
     """
 
     def __init__(self, output: Output, world_frame: str, *, sensor_tf: bool = True, several: bool = False) -> None:
@@ -246,7 +232,6 @@ class BodyTopics:
         return self._send_world(message) if isinstance(message, PoseWorld) else 0
 
     def send_clock(self, stamp_ns: int) -> None:
-        """Publish the time of a replay."""
         self._send("clock", new("rosgraph_msgs/msg/Clock", clock=header(max(stamp_ns, 0), "").stamp))
 
     def forget(self, source: str) -> None:
@@ -296,13 +281,12 @@ class BodyTopics:
         last = self._measured.get(name)
         if last is None or max(np.abs(mean[link] - at).max() for link, at in last.items()) > GROWN:
             self._measured[name] = mean
-            told = new("std_msgs/msg/String", data=urdf(name, mean))
-            self._send(f"{BODIES}/{name}/urdf", told, latched=True)
+            self._send(f"{BODIES}/{name}/urdf", new("std_msgs/msg/String", data=urdf(name, mean)), latched=True)
 
     def _send_sensor(self, clean: PoseClean) -> None:
         """Publish a sensor's pose: of a static sensor once on /tf_static, of a moving one on /tf with each message.
 
-        A late subscriber receives only the last message of /tf_static, so each contains all static sensors.
+        A late subscriber receives only the last message of /tf_static, so each has all static sensors.
         """
         frame, pose, world = clean.frame_id, clean.sensor_pose, self._world_frame
         if not self._sensor_tf or not clean.calibrated or frame in ("", world):
@@ -312,14 +296,13 @@ class BodyTopics:
             return transform(clean.stamp_ns, world, frame, pose.position, pose.orientation)
 
         if frame not in self._moving:
-            last = self._still.get(frame)
-            if last == pose:
+            if self._still.get(frame) == pose:
                 return
-            if last is None:
-                self._still[frame] = pose
-            else:
+            if frame in self._still:
                 self._moving.add(frame)
                 del self._still[frame]
+            else:
+                self._still[frame] = pose
             still = tf_message([placed(*sensor) for sensor in self._still.items()])
             self._send("tf_static", still, latched=True)
         if frame in self._moving:

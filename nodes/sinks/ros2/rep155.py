@@ -61,7 +61,6 @@ def _links() -> dict[str, Link]:
 
 LINKS: Mapping[str, Link] = _links()
 """Links by name, without the body's id; ``body`` is the root."""
-
 JOINTS: tuple[str, ...] = (
     "waist", "r_head", "y_head", "p_head",
     *(f"{side}_{joint}" for side in "lr" for joint in ("y_shoulder", "p_shoulder", "r_shoulder", "elbow")),

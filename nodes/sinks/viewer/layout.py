@@ -40,8 +40,6 @@ STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.ui
 RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(_rgb, (RAW_COLOUR, TRUTH_COLOUR, CONTACT_COLOUR, ALARM_COLOUR))
 PATH_RGB = [235, 235, 235]
 RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED]), POSE_WORLD: CONTACT_RGB}
-
-
 LEGEND = """
 - **blue** left, **orange** right
 - **faint** not observed: inferred; the sphere is its standard deviation
@@ -66,10 +64,9 @@ def name_series(recording: rr.RecordingStream) -> None:
     import rerun as rr
 
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    states = rr.SeriesLines(
-        names=[state.name.lower() for state in JointState], colors=STATE_RGB, widths=[2.0] * len(JointState)
-    )
-    recording.log("plots/joints", states, static=True)
+    states = [state.name.lower() for state in JointState]
+    lines = rr.SeriesLines(names=states, colors=STATE_RGB, widths=[2.0] * len(states))
+    recording.log("plots/joints", lines, static=True)
     for topic, colour in RATE_RGB.items():
         recording.log(f"plots/rates/{topic}", rr.SeriesLines(names=topic, colors=colour, widths=2), static=True)
     flagged = rr.SeriesPoints(names="flagged", colors=ALARM_RGB, markers="circle", marker_sizes=3)
@@ -89,11 +86,8 @@ def blueprint(eye: Eye | None, *, calibrated: bool, scored: bool, images: bool =
     """
     import rerun.blueprint as rrb
 
-    last_half_minute = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-30.0),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    last_half_minute = rrb.VisibleTimeRange(TIMELINE, start=cursor(seconds=-30.0), end=cursor())
 
     def scene(origin: str, name: str, *, distance: float, height: float, floor: bool) -> rrb.Spatial3DView:
         controls = None

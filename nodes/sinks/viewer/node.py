@@ -1,8 +1,7 @@
-"""The viewer: raw and clean poses side by side in a browser, through Rerun.
+"""The viewer: raw and clean poses side by side in a browser, through Rerun (extra ``view``).
 
-It only subscribes, so it does not affect the poses. `PoseView` turns messages into drawings, and knows neither sockets
-nor nodes. `ViewerServer` keeps the last minutes of drawings and serves them with the page. Both need the optional extra
-``view``.
+It only subscribes, so it does not affect the poses. `PoseView` turns messages into drawings; `ViewerServer` keeps the
+last minutes of drawings, and serves them with the page.
 """
 
 from __future__ import annotations

@@ -58,23 +58,20 @@ BELOW_TRUNK = 0.25
 """Distance from the middle of the trunk down to the middle of a standing body, metres."""
 BACK_JUMP_NS = 1_000_000_000
 """Backward step of stamps beyond which a stream counts as restarted, nanoseconds."""
-
 MOST_IMAGES = 30
 """Largest number of images that wait for their poses; two seconds of images."""
-
 _TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
 
 class PoseView:
-    """Draws messages in three scenes (raw, clean, world), and plots corrections, joint states, rates and, if the prior
-    gives them, anomaly scores.
+    """Draws messages in three scenes (raw, clean, world), and plots corrections, joint states, rates and anomaly
+    scores.
 
-    Everything is drawn in the z-up world; raw and clean are transformed by the message's sensor pose. Time is capture
-    time since the first message.
+    Everything is drawn in the z-up world, to which raw and clean are transformed by the message's sensor pose. Time is
+    capture time since the first message. ``threshold`` is the anomaly score above which the prior raises its flag.
     """
 
     def __init__(self, recording: rr.RecordingStream, threshold: float = math.nan) -> None:
-        """Draw into a recording; ``threshold`` is the anomaly score above which the prior raises its flag."""
         self._log, self._threshold = recording.log, threshold
         self._recording = recording
         self._origin_ns: int | None = None
@@ -91,12 +88,7 @@ class PoseView:
         self._send_layout()
 
     def log(self, topic: str, message: Message) -> None:
-        """Draw one message.
-
-        Raises:
-            ValueError: the message cannot be drawn: its skeleton is unknown, its number of joints is wrong, or its
-                sensor pose is invalid.
-        """
+        """Draw one message. Raises ValueError if its skeleton, number of joints or sensor pose is invalid."""
         if isinstance(message, Diagnostics):
             self._draw_rates(message)
             return
@@ -130,11 +122,9 @@ class PoseView:
         if not self._has_images:
             self._has_images = True
             self._send_layout()
-        pose = message.sensor_pose
+        pose, axes = message.sensor_pose, rr.ViewCoordinates.RDF
         self._log("camera", rr.Transform3D(translation=pose.position, quaternion=rr.Quaternion(xyzw=pose.orientation)))
-        lens = rr.Pinhole(
-            image_from_camera=newest.intrinsics, resolution=newest.size, camera_xyz=rr.ViewCoordinates.RDF
-        )
+        lens = rr.Pinhole(image_from_camera=newest.intrinsics, resolution=newest.size, camera_xyz=axes)
         self._log("camera/image", lens)
         self._log("camera/image", rr.EncodedImage(contents=newest.jpeg, media_type="image/jpeg"))
 
@@ -157,8 +147,10 @@ class PoseView:
             path = _entity("raw", message.source, body)
             positions = to_world(body.positions, message.sensor_pose)
             canonical, _ = to_canonical(skeleton, positions, body.confidence)
-            seen = np.isfinite(positions).all(axis=1)
-            self._log(f"{path}/joints", rr.Points3D(positions[seen], radii=0.016, colors=_grey(body.confidence[seen])))
+            observed = np.isfinite(positions).all(axis=1)
+            shade = 70 + 185 * np.clip(np.nan_to_num(body.confidence[observed]), 0, 1)  # higher confidence is whiter
+            grey = np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)
+            self._log(f"{path}/joints", rr.Points3D(positions[observed], radii=0.016, colors=grey))
             self._bones(f"{path}/bones", canonical, pairs, SIDE_RGB[SIDES[pairs[:, 1]]])
             yield path, canonical
 
@@ -201,17 +193,12 @@ class PoseView:
                 continue
             path = _entity("world", message.source, body)
             self._body(path, positions, body.state, body.sigma)
-            self._log(
-                f"{path}/path", rr.LineStrips3D([self._floor_path(path, message, body)], colors=PATH_RGB, radii=0.01)
-            )
-            touching = body.contacts > CONTACT_PROBABILITY
-            self._log(
-                f"{path}/contacts", rr.Points3D(positions[CONTACT_INDICES[touching]], colors=CONTACT_RGB, radii=0.035)
-            )
-            arrow = rr.Arrows3D(
-                origins=[body.root_position], vectors=[body.root_velocity], colors=PATH_RGB, radii=0.012
-            )
-            self._log(f"{path}/velocity", arrow)
+            trail = self._floor_path(path, message, body)
+            self._log(f"{path}/path", rr.LineStrips3D([trail], colors=PATH_RGB, radii=0.01))
+            touching = positions[CONTACT_INDICES[body.contacts > CONTACT_PROBABILITY]]
+            self._log(f"{path}/contacts", rr.Points3D(touching, colors=CONTACT_RGB, radii=0.035))
+            root, velocity = [body.root_position], [body.root_velocity]
+            self._log(f"{path}/velocity", rr.Arrows3D(origins=root, vectors=velocity, colors=PATH_RGB, radii=0.012))
             standing = "" if body.tracking == Tracking.OK else f" · {body.tracking.name.lower()}"
             above = positions[[J["head"]]] + [0, 0, 0.28]
             label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=PATH_RGB, radii=0.0)
@@ -228,19 +215,14 @@ class PoseView:
         shown = (state != JointState.UNKNOWN) & np.isfinite(positions).all(axis=1)
         colours = np.where(np.isin(state, OBSERVED)[:, None], SIDE_RGB[SIDES], FAINT_RGB[SIDES])
         self._log(f"{path}/joints", rr.Points3D(positions[shown], radii=0.018, colors=colours[shown]))
-        guessed = shown & (state == JointState.IMPUTED)
+        imputed = shown & (state == JointState.IMPUTED)
         spheres = rr.Ellipsoids3D(
-            centers=positions[guessed],
-            radii=sigma[guessed],
-            colors=colours[guessed],
-            line_radii=0.0008,
-            fill_mode="majorwireframe",
-        )
+            centers=positions[imputed], radii=sigma[imputed], colors=colours[imputed],
+            line_radii=0.0008, fill_mode="majorwireframe",
+        )  # fmt: skip
         self._log(f"{path}/sigma", spheres)
 
-    def _bones(
-        self, path: str, positions: NDArray, pairs: NDArray[np.intp], colours: Any, radius: float = 0.011
-    ) -> None:
+    def _bones(self, path: str, positions: NDArray, pairs: NDArray, colours: Any, radius: float = 0.011) -> None:
         import rerun as rr
 
         ends = positions[pairs]
@@ -307,9 +289,3 @@ def _entity(root: str, source: str, body: RawBody | CleanBody | WorldBody) -> st
     import rerun as rr
 
     return f"{root}/{rr.escape_entity_path_part(source or 'source')}/{body.id}"
-
-
-def _grey(confidence: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """(J, 3) RGB greys; higher confidence is whiter."""
-    shade = 70 + 185 * np.clip(np.nan_to_num(confidence), 0, 1)
-    return np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)

@@ -1,6 +1,4 @@
-"""Keeps the last minutes of drawings, and serves them with Rerun's page to browsers with access
-(`nodes.sinks.serving`). A Content-Security-Policy restricts the page's connections to this server.
-"""
+"""Keeps the last minutes of drawings, and serves them with Rerun's page to browsers with access (`sinks.serving`)."""
 
 from __future__ import annotations
 
@@ -166,18 +164,13 @@ class ViewerError(RuntimeError):
 class ViewerServer(Closing):
     """Keeps the drawings, and serves them and the page that shows them to browsers with the token.
 
-    By default it listens on this machine only, so that others on the network cannot see the people. The token keeps out
-    other users of this machine. The page comes from a Rerun process that has no drawings. It is passed on with a
-    Content-Security-Policy that lets it connect only to this server; otherwise it would send telemetry and check for
-    new versions.
+    By default it listens on this machine only. The token keeps out other users of this machine. The page comes from a
+    Rerun process that has no drawings. It is passed on with a Content-Security-Policy that lets it connect only to this
+    server; otherwise it would send telemetry and check for new versions.
     """
 
     def __init__(self, port: int, host: str = LOOPBACK) -> None:
-        """Start serving the page and the drawings.
-
-        Raises:
-            ViewerError: the port is taken, or Rerun's server does not start.
-        """
+        """Start serving. Raises ViewerError if the port is taken, or Rerun's server does not start."""
         import rerun_cli
 
         self._page: PageServer | None = None
@@ -221,11 +214,7 @@ class ViewerServer(Closing):
         return recording
 
     def check(self) -> None:
-        """Check that Rerun's server is running.
-
-        Raises:
-            RuntimeError: the server has stopped. Unlike after a `ViewerError`, a restart helps.
-        """
+        """Raise RuntimeError if Rerun's server has stopped. Unlike after a `ViewerError`, a restart helps."""
         if self._process.poll() is not None:
             raise RuntimeError(f"Rerun's server has stopped, exit code {self._process.returncode}")
 

@@ -59,10 +59,8 @@ class WebSettings:
     def __post_init__(self) -> None:
         check_host_and_port("web", self.host, self.port, least=0)
         if self.token and (len(self.token) < 16 or not all(c.isalnum() or c in "-_" for c in self.token)):
-            raise LaunchError(
-                f"[web] token: expected 16 or more letters, digits, - and _, got {len(self.token)} characters; "
-                "leave it out for a random one"
-            )
+            got = f"{len(self.token)} characters; leave it out for a random one"
+            raise LaunchError(f"[web] token: expected 16 or more letters, digits, - and _, got {got}")
 
 
 TOKEN_FILE = "web_token"
@@ -97,12 +95,9 @@ class WebNode(Node):
 
     def handle(self, topic: str, message: Message) -> None:
         assert self._server
-        text = to_json(message)
-        if text is not None:
-            stream = (
-                f"{DIAGNOSTICS}/{message.node}" if isinstance(message, Diagnostics) else f"{topic}/{message.source}"
-            )
-            self._server.send(stream, text, replaces=topic != POSE_EVENTS)
+        if (text := to_json(message)) is not None:
+            sender = message.node if isinstance(message, Diagnostics) else message.source
+            self._server.send(f"{topic}/{sender}", text, replaces=topic != POSE_EVENTS)
 
     def status(self) -> dict[str, str]:
         server = self._server

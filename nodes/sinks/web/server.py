@@ -49,15 +49,8 @@ STREAMS_KEPT = 64
 class WebServer:
     """HTTP and WebSocket at one port (0: any free one), for clients that give the token.
 
-    Requests must call ``host``, this machine's own names, or one of ``names``.
-
-    Attributes:
-        url: address of the page, with the token.
-        clients: number of connected clients.
-        dropped: number of messages dropped for slow clients.
-
-    Raises:
-        LaunchError: the port cannot be opened.
+    Requests must call ``host``, this machine's own names, or one of ``names``. ``url`` is the page's address, with the
+    token; ``dropped`` counts the messages dropped for slow clients.
     """
 
     def __init__(self, host: str, port: int, names: Collection[str], token: str, greeting: str) -> None:
@@ -79,6 +72,7 @@ class WebServer:
 
     @property
     def clients(self) -> int:
+        """Number of connected clients."""
         return len(self._clients)
 
     def send(self, stream: str, text: str, *, replaces: bool) -> None:
@@ -105,7 +99,7 @@ class WebServer:
         try:
             # clients send nothing; no compression, because it takes 300 kB per client and most are on this machine
             server = await serve(
-                self._talk, host, port, process_request=self._answer, compression=None, max_size=1024, max_queue=1,
+                self._talk, host, port, process_request=self._respond, compression=None, max_size=1024, max_queue=1,
                 close_timeout=1,
             )  # fmt: skip
         except OSError as error:
@@ -138,7 +132,7 @@ class WebServer:
             feeding.cancel()
             await asyncio.gather(feeding, return_exceptions=True)
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """The response to a request; None upgrades it to a WebSocket."""
         host = ", ".join(request.headers.get_all("Host"))
         own = called(host, self._names)
@@ -148,14 +142,10 @@ class WebServer:
                 f"not served under the name {host!r}: add it to [web] names if browsers reach this machine by it\n",
             )
         path, _, query = request.path.partition("?")
-        if path == "/ws":
-            return self._admit(connection, parse_qs(query).get("token", [""])[0])
-        if path not in FILES:
-            return connection.respond(HTTPStatus.NOT_FOUND, f"there are {', '.join(FILES)}, and the WebSocket /ws\n")
-        return _file(FILES[path], own)
-
-    def _admit(self, connection: ServerConnection, token: str) -> Response | None:
-        if not is_token(token, self._token):
+        if path != "/ws":
+            there = f"there are {', '.join(FILES)}, and the WebSocket /ws\n"
+            return _file(FILES[path], own) if path in FILES else connection.respond(HTTPStatus.NOT_FOUND, there)
+        if not is_token(parse_qs(query).get("token", [""])[0], self._token):
             return connection.respond(
                 HTTPStatus.UNAUTHORIZED, "expected /ws?token=TOKEN, with the token after the # of the printed address\n"
             )

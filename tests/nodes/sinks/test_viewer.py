@@ -208,7 +208,7 @@ def test_the_server_listens_on_this_machine_alone_and_at_a_port_that_is_free() -
     with ViewerServer(port):
         listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines() if " 0A " in line]
         assert [at.partition(":")[0] for at in listening if int(at.partition(":")[2], 16) == port] == ["0100007F"]
-        with pytest.raises(ViewerError, match=f"port {port} at 127.0.0.1 is not to be had"):
+        with pytest.raises(ViewerError, match=f"port {port} at 127.0.0.1 cannot be opened"):
             ViewerServer(port)
     ViewerServer(port).close()
 

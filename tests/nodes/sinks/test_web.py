@@ -138,7 +138,7 @@ def test_there_are_no_more_clients_than_there_is_room_for_and_one_server_at_a_po
         with pytest.raises(InvalidStatus, match="503"), client(server):
             pass
     until(lambda: server.clients == 0)
-    with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 is not to be had"):
+    with pytest.raises(LaunchError, match=f"port {server.port} at 127.0.0.1 cannot be opened"):
         WebServer("127.0.0.1", server.port, [], TOKEN, hello())
 
 
