@@ -45,7 +45,6 @@ COMMANDS = {
     "keys": ("small", "make CurveZMQ keys, for messages between machines"),
 }
 """Module and one-line help of each command. Modules without a dot in their name are in `nodes.commands`."""
-
 TOPICS = ("upgrade", "uninstall")
 """What `help` explains beside the commands."""
 USAGE_ERROR = 2
@@ -94,11 +93,11 @@ def _main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:
-        if (told := told_of(error)) is None:
+        if (message := message_of(error)) is None:
             raise
         from steadypose.nodes.settings import printable  # imports numpy
 
-        print(f"steadypose {name}: {printable(told)}", file=sys.stderr)
+        print(f"steadypose {name}: {printable(message)}", file=sys.stderr)
         return USAGE_ERROR
     return status if isinstance(status, int) else 0
 
@@ -129,9 +128,9 @@ def _run(name: str, arguments: list[str]) -> object:
 
 
 def _prepare_help(documented: Iterable[Any]) -> None:
-    """Join each argument's description into one line, because tyro keeps the source's line breaks, as it does in a
-    paragraph before a line that begins with a sign; and have tyro leave out "(default: None)", because the description
-    says what happens without the argument.
+    """Adapt docstrings to tyro, which keeps the source's line breaks: join each argument's description into one line.
+
+    "(default: None)" is left out, because descriptions say what happens without the argument.
     """
     from tyro.conf import arg
 
@@ -162,8 +161,8 @@ def _wrapped() -> Iterator[None]:
             print(line if line[:1] in (" ", "│", "╭", "╰", "") else textwrap.fill(line, width, break_on_hyphens=False))
 
 
-def told_of(error: Exception) -> str | None:
-    """What the user is told of an error that is steadypose's own, an OSError or a missing extra; None of a bug."""
+def message_of(error: Exception) -> str | None:
+    """What to print for an error that is steadypose's own, an OSError or a missing extra; None for a bug."""
     if isinstance(error, ModuleNotFoundError):
         if error.name == "steadypose.benchmarks":
             return "the studies are not installed: expected a checkout of the project"

@@ -1,8 +1,8 @@
 """A folder of recordings, cleaned many at once: on the cores at hand, or on a Ray cluster.
 
-A manifest in the output folder has a line for each recording that is to be cleaned, and one when it is. What it says
-is done is not done again, unless the recording, the settings or the models have changed: so a run that was stopped goes
-on where it was, and one with new recordings does these.
+A manifest in the output folder has a line for each recording that is to be cleaned, and one when it is. A recording
+that is done is not cleaned again, unless it, the settings or the models have changed. So a run that was stopped is
+resumed, and one with new recordings does these.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from steadypose.nodes.cli import told_of
+from steadypose.nodes.cli import message_of
 from steadypose.nodes.commands.output import NO_POSE, UNTRUSTED, clean_recording
 from steadypose.nodes.driving import Settings
 from steadypose.nodes.extras import require_extra
@@ -39,6 +39,7 @@ _LINE = '{"input": '
 """how each line of it begins"""
 FILES = (".npz", ".csv", *SUFFIXES)
 """endings of files of poses that are cleaned into an .npz each"""
+CLEAN = "clean"
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,9 @@ def find_recordings(folder: Path) -> list[Path]:
 
 
 def plan(folder: Path, out: Path) -> list[Job]:
-    """A job for each recording; recordings stay recordings, files of poses become .npz, names and folders stay.
+    """A job for each recording: recordings stay recordings, files of poses become .npz, names and folders stay.
 
-    Raises:
-        LaunchError: there are none, or two of them would come to the same output.
+    Raises LaunchError if there are none, or two of them would come to the same output.
     """
     jobs: dict[Path, Job] = {}
     for source in find_recordings(folder):
@@ -93,24 +93,19 @@ def plan(folder: Path, out: Path) -> list[Job]:
             raise LaunchError(f"{jobs[target].source} and {source} would both become {target}: rename one of them")
         jobs[target] = Job(source, target)
     if not jobs:
-        raise LaunchError(
-            f"{folder}: expected recordings (rosbag2 directories, .mcap or {', '.join(FILES)}), found none"
-        )
+        raise LaunchError(f"{folder}: expected rosbag2 directories, .mcap, {', '.join(FILES)}; got none")
     return list(jobs.values())
 
 
 def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, ray: bool, console: Console) -> int:
     """Clean all recordings of a folder that are not cleaned yet: ``jobs`` at once (None: one a core), or with Ray.
 
-    Returns:
-        the exit status: 0 if all are clean, those that were done before included.
-
-    Raises:
-        LaunchError: nothing can be done at all.
+    Returns the exit status: 0 if all are clean, those that were done before included. Raises LaunchError if nothing can
+    be done at all.
     """
     folder, out = folder.resolve(), out.resolve()
     if out.is_relative_to(folder) or folder.is_relative_to(out):
-        raise LaunchError(f"{out}: expected a folder apart from {folder}; else results would be cleaned in their turn")
+        raise LaunchError(f"{out}: expected a folder apart from {folder}, or results would be cleaned too")
     if jobs is not None and (ray or jobs < 1):
         raise LaunchError("--jobs: " + ("Ray decides how many" if ray else f"expected 1 or more, got {jobs}"))
     found = plan(folder, out)
@@ -122,7 +117,8 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     for job in waiting:
         if job.replace or not os.path.lexists(job.out):
             manifest.add(job, {"state": "started"})
-    cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or _cores())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cleaning = on_ray(waiting, settings) if ray else on_cores(waiting, settings, jobs or cores)
     outcomes = Counter(outcome(job, result)[0] for job, result in done.items())
     with Progress(console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(folder.name, total=len(found), completed=len(done))
@@ -140,9 +136,6 @@ def clean_folder(folder: Path, out: Path, settings: Settings, jobs: int | None, 
     return 0 if outcomes[CLEAN] == len(found) else 1
 
 
-CLEAN = "clean"
-
-
 def outcome(job: Job, result: Mapping[str, Any]) -> tuple[str, str]:
     """What became of a recording, by its entry in the manifest; and why it is not clean, empty if it is."""
     if result["state"] == "failed":
@@ -157,10 +150,9 @@ def outcome(job: Job, result: Mapping[str, Any]) -> tuple[str, str]:
 
 
 class Manifest:
-    """What became of each recording of ``folder``: ``out/manifest.jsonl``, a JSON object a line; the last counts.
+    """The result of each recording of ``folder``: ``out/manifest.jsonl``, a JSON object a line; the last counts.
 
-    Raises:
-        LaunchError: the output folder holds something else.
+    Raises LaunchError if the output folder holds something else.
     """
 
     def __init__(self, out: Path, folder: Path, settings: Settings) -> None:
@@ -170,9 +162,7 @@ class Manifest:
         if self.path.exists():
             text = self.path.read_text(encoding="utf-8", errors="replace")
             if not all(line[: len(_LINE)] == _LINE[: len(line)] for line in text.splitlines()):
-                raise LaunchError(
-                    f"{self.path} is not of an earlier call: expected a new folder, or one that this made"
-                )
+                raise LaunchError(f"{self.path} is not of an earlier call: expected a new folder, or one of this")
             if text and not text.endswith("\n"):  # cut short by whatever stopped the run that wrote it
                 with self.path.open("a", encoding="utf-8") as file:
                     file.write("\n")
@@ -187,10 +177,7 @@ class Manifest:
     def made(self, out: Path) -> bool:
         """Whether an earlier call made what is at this path, or began to."""
         output = str(out.relative_to(self._out))
-        return any(
-            entry.get("state") in ("started", "done") and entry.get("output") == output
-            for entry in self._known.values()
-        )
+        return any(e.get("state") in ("started", "done") and e.get("output") == output for e in self._known.values())
 
     def result(self, job: Job) -> dict[str, Any] | None:
         """The result of this recording, as it is now, with these settings; None if it was not cleaned so."""
@@ -199,10 +186,8 @@ class Manifest:
         return entry if done else None
 
     def add(self, job: Job, result: dict[str, Any]) -> None:
-        """Note what became of a recording."""
-        entry = self._signature(job) | result
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+            file.write(json.dumps(self._signature(job) | result) + "\n")
 
     def _signature(self, job: Job) -> dict[str, Any]:
         """What a result belongs to: the recording, by size and time of change, the settings, and the models."""
@@ -227,11 +212,11 @@ def _models() -> str:
 
 
 def work(job: Job, settings: Settings) -> dict[str, Any]:
-    """Clean one recording; whatever goes wrong is the result."""
+    """Clean one recording; a failure is a result, too."""
     try:
         return {"state": "done"} | asdict(clean_recording(job.source, job.out, settings, replace=job.replace))
     except Exception as error:  # any file may hold what nobody thought of, and the others wait
-        return _failed(told_of(error) or "".join(traceback.format_exception_only(error)).strip())
+        return _failed(message_of(error) or "".join(traceback.format_exception_only(error)).strip())
 
 
 def _failed(error: str) -> dict[str, Any]:
@@ -239,7 +224,7 @@ def _failed(error: str) -> dict[str, Any]:
 
 
 def on_cores(jobs: Iterable[Job], settings: Settings, cores: int) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Clean recordings in processes of this machine; gives each result as it comes.
+    """Clean recordings in processes of this machine; yields each result as it comes.
 
     A process that dies, for want of memory or by a fault in a library, takes one recording with it, not the rest.
     Processes of `multiprocessing` would import modules of the working folder.
@@ -272,10 +257,9 @@ class _Worker:
 
     def __init__(self, settings: Settings) -> None:
         self.connection, theirs = Pipe()
-        serve = own_command("steadypose.nodes.commands.batch:serve", str(theirs.fileno()))
-        self.process = subprocess.Popen(
-            serve, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=own_environment()
-        )
+        end = theirs.fileno()
+        serve = own_command("steadypose.nodes.commands.batch:serve", str(end))
+        self.process = subprocess.Popen(serve, pass_fds=[end], stdin=subprocess.DEVNULL, env=own_environment())
         theirs.close()  # so that its end closes with the process
         with suppress(OSError):
             self.connection.send(settings)
@@ -306,16 +290,8 @@ def serve() -> None:
         connection.send(work(job, settings))
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def on_ray(jobs: Iterable[Job], settings: Settings) -> Iterator[tuple[Job, dict[str, Any]]]:
-    """Clean recordings on a Ray cluster, one a core; gives each result as it comes.
-
-    Raises:
-        LaunchError: Ray is not installed.
-    """
+    """Clean recordings on a Ray cluster, one a core; yields each result. Raises LaunchError if Ray is not installed."""
     require_extra("ray")
     import ray  # pyright: ignore[reportMissingImports]
 

@@ -13,16 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from steadypose.msgs.types import Pose
-from steadypose.nodes.commands.calibrate_files import (
-    depth_image,
-    lens_of,
-    read_depth,
-    read_images,
-    read_launch,
-    save_calibration,
-    write_floor_grid,
-    write_image,
-)
+from steadypose.nodes.commands import calibrate_files as files
 from steadypose.nodes.commands.calibrate_sensor import CalibrateSensor
 from steadypose.nodes.commands.output import File, check_folder
 from steadypose.nodes.sources.registry import InputSettings
@@ -78,9 +69,8 @@ class PrintBoard:
             raise CalibrationError(f"expected a .pdf or .png to write, got {self.out}")
         check_folder(self.out)
         width, height = PAPERS_MM[self.paper]
-        square = (
-            np.floor(2 * min((width - 2 * _MARGIN_MM) / self.columns, (height - 2 * _MARGIN_MM) / self.rows)) / 2
-        )  # half millimetres
+        most = min((width - 2 * _MARGIN_MM) / self.columns, (height - 2 * _MARGIN_MM) / self.rows)
+        square = np.floor(2 * most) / 2  # half millimetres
         board = Board(self.columns, self.rows, square / 1000)
         across, up = (1000 * side for side in board.size)
         left, bottom = (width - across) / 2, (height - up) / 2
@@ -133,20 +123,19 @@ class CalibrateLens(_OfBoard):
     """
 
     def run(self) -> None:
-        read_launch(self.launch)
+        files.read_launch(self.launch)
         views, sizes, images = [], set(), 0
-        for name, image in read_images(self.images):
+        for name, image in files.read_images(self.images):
             images += 1
             view = find_corners(image, self.board)
             print(f"{name}: {f'{len(view.image)} corners' if view else 'no board'}")
             sizes.add(image.shape[1::-1])
             views += [view] if view else []
         if len(sizes) > 1:
-            raise CalibrationError(
-                f"expected images of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))}"
-            )
+            got = ", ".join(f"{w} x {h}" for w, h in sorted(sizes))
+            raise CalibrationError(f"expected images of one size, got {got}")
         lens = calibrate_lens(views, sizes.pop())
-        save_calibration(self.launch, lens=lens)
+        files.save_calibration(self.launch, lens=lens)
         angle = 2 * np.degrees(np.arctan(0.5 * lens.size[0] / lens.focal[0]))
         print(
             f"\nlens from {len(views)} of {images} images, {lens.error_px:.2f} pixels off on average "
@@ -175,26 +164,24 @@ class CalibratePose(_OfBoard):
     picture: File = None
 
     def run(self) -> None:
-        lens = lens_of(self.launch)
+        lens = files.lens_of(self.launch)
         views, last = [], None
-        for name, image in read_images(self.images):
-            if image.shape[1::-1] != lens.size:
-                raise CalibrationError(
-                    f"{name}: expected {lens.size[0]} x {lens.size[1]} pixels, as the lens was calibrated for, got "
-                    f"{image.shape[1]} x {image.shape[0]}"
-                )
+        for name, image in files.read_images(self.images):
+            if (size := image.shape[1::-1]) != lens.size:
+                expected = f"expected {lens.size[0]} x {lens.size[1]} pixels, as of the calibrated lens"
+                raise CalibrationError(f"{name}: {expected}, got {size[0]} x {size[1]}")
             view, last = find_corners(image, self.board), image
             print(f"{name}: {f'{len(view.image)} corners' if view else f'fewer than {MIN_CORNERS} corners'}")
             views += [view] if view else []
-        found = camera_pose(views, lens)
+        camera = camera_pose(views, lens)
         assert last is not None, "without an image there is no pose"
-        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), last, lens, found.pose)
-        save_calibration(self.launch, pose=found.pose)
+        files.write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), last, lens, camera.pose)
+        files.save_calibration(self.launch, pose=camera.pose)
         print(
-            f"\n{_described(found.pose)}; most corners within {found.error_px:.2f} pixels; "
-            f"sure to {1e3 * found.sigma_m:.1f} mm and {np.degrees(found.sigma_rad):.2f} degrees"
+            f"\n{_described(camera.pose)}; most corners within {camera.error_px:.2f} pixels; "
+            f"sure to {1e3 * camera.sigma_m:.1f} mm and {np.degrees(camera.sigma_rad):.2f} degrees"
         )
-        if found.sigma_m > GOOD_SIGMA_M:
+        if camera.sigma_m > GOOD_SIGMA_M:
             print("More images, a larger board, or the board nearer to the camera would make it more certain.")
         print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
@@ -224,13 +211,14 @@ class CalibrateFloor:
     picture: File = None
 
     def run(self) -> None:
-        lens = lens_of(self.launch)
-        depth = read_depth(self.depth)
+        lens = files.lens_of(self.launch)
+        depth = files.read_depth(self.depth)
         if not np.isfinite(self.up).all() or not np.linalg.norm(self.up) > 0:
             raise CalibrationError(f"--up: expected a direction, got {self.up}")
         pose, share = floor_pose(points_of_depth(depth, lens), np.array(self.up))
-        write_floor_grid(self.picture or self.launch.with_suffix(".floor.png"), depth_image(depth), lens, pose)
-        save_calibration(self.launch, pose=pose)
+        out = self.picture or self.launch.with_suffix(".floor.png")
+        files.write_floor_grid(out, files.depth_image(depth), lens, pose)
+        files.save_calibration(self.launch, pose=pose)
         print(f"{_described(pose)}; {share:.0%} of what it sees is floor")
         print(f"{self.launch}: [input.calibration] written; poses of this camera are calibrated now")
 
@@ -252,7 +240,7 @@ class CalibrateOak:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
 
     def run(self) -> None:
-        launch = read_launch(self.launch)
+        launch = files.read_launch(self.launch)
         from steadypose.nodes.sources.oak_device import capture_with_camera  # brings depthai
 
         try:
@@ -260,12 +248,12 @@ class CalibrateOak:
         except RuntimeError as error:
             raise CalibrationError(str(error)) from error
         image, depth = self.out.with_name(f"{self.out.name}.png"), self.out.with_name(f"{self.out.name}.depth.png")
-        write_image(image, still.colour)
-        write_image(depth, still.depth)
+        files.write_image(image, still.colour)
+        files.write_image(depth, still.depth)
         height, width = still.depth.shape
         focal, centre = still.intrinsics[[0, 1], [0, 1]], still.intrinsics[:2, 2]
         lens = Intrinsics((width, height), (float(focal[0]), float(focal[1])), (float(centre[0]), float(centre[1])))
-        save_calibration(self.launch, lens=lens)
+        files.save_calibration(self.launch, lens=lens)
         up = "" if still.up is None else " --up " + " ".join(f"{value:.3f}" for value in still.up)
         print(f"{self.launch}: [input.calibration] has the camera's lens now. With the board on the floor:")
         print(f"  steadypose calibrate pose {self.launch} {image} --square METRES")

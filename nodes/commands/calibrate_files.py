@@ -1,4 +1,4 @@
-"""Files of `calibrate`: images, read and drawn with the floor that was found, and the launch file that is written."""
+"""Files of `calibrate`: images, read and drawn with the estimated floor, and the launch file that is written."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from steadypose.nodes.sources.webcam_device import stamped_images
 from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import CalibrationError, Intrinsics
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEO_STEP_NS = 500_000_000
 """between the images taken from a video: nearer ones show the same again"""
-MAX_PICTURES = 60
+MAX_IMAGES = 60
 AXIS_PX = 4
 REACH_M = 6.0
 """half the side of the grid that is drawn"""
@@ -35,25 +35,21 @@ Image = NDArray[np.uint8]
 
 
 def read_images(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
-    """Pictures by name, from files, folders and videos.
-
-    Raises:
-        CalibrationError: there are none, or one cannot be read.
-    """
+    """Images by name, from files, folders and videos. Raises CalibrationError if there are none, or one is damaged."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            files += sorted(file for file in path.iterdir() if file.suffix.lower() in PICTURES)
+            files += sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGES)
         elif path.is_file():
             files.append(path)
         else:
             raise CalibrationError(f"{path} does not exist: expected an image, a folder of images, or a video")
     if not files:
         where = f" in {', '.join(map(str, paths))}" if paths else ""
-        raise CalibrationError(f"expected images ({', '.join(PICTURES)}), folders of them, or videos; got none{where}")
-    if len(files) > MAX_PICTURES:
-        print(f"of {len(files)} images the first {MAX_PICTURES} are taken")
-    for file in track(files[:MAX_PICTURES], "reading", disable=len(files) < 2):
+        raise CalibrationError(f"expected images ({', '.join(IMAGES)}), folders of them, or videos; got none{where}")
+    if len(files) > MAX_IMAGES:
+        print(f"of {len(files)} images the first {MAX_IMAGES} are taken")
+    for file in track(files[:MAX_IMAGES], "reading", disable=len(files) < 2):
         if file.suffix.lower() in VIDEOS:
             yield from _frames(file)
             continue
@@ -66,7 +62,7 @@ def read_images(paths: Sequence[Path]) -> Iterator[tuple[str, Image]]:
 def _frames(file: Path) -> Iterator[tuple[str, Image]]:
     taken = next_ns = 0
     for stamp_ns, image in stamped_images(cv2.VideoCapture(str(file))):
-        if taken == MAX_PICTURES:
+        if taken == MAX_IMAGES:
             break
         if image is not None and stamp_ns >= next_ns:
             taken, next_ns = taken + 1, stamp_ns + VIDEO_STEP_NS
@@ -90,7 +86,7 @@ def read_depth(file: Path) -> NDArray[np.integer]:
 
 
 def draw_floor(image: Image, lens: Intrinsics, pose: Pose) -> Image:
-    """A grey image (H, W) as colours (H, W, 3), BGR, with the floor's grid, every metre bolder, and the world's axes.
+    """A grey image (H, W) as BGR (H, W, 3), with the floor's grid, every metre bolder, and the world's axes.
 
     The grid lies around the point that the camera looks at, or stands above.
     """
@@ -141,9 +137,7 @@ def write_image(out: Path, image: NDArray[Any]) -> None:
     except cv2.error:  # an ending it does not know
         written = False
     if not written:
-        raise CalibrationError(
-            f"{out} cannot be written: expected an image such as .png or .jpg in a folder that exists"
-        )
+        raise CalibrationError(f"{out} cannot be written: expected an image such as .png in a folder that exists")
 
 
 def write_floor_grid(out: Path, image: Image, lens: Intrinsics, pose: Pose) -> None:
@@ -153,9 +147,7 @@ def write_floor_grid(out: Path, image: Image, lens: Intrinsics, pose: Pose) -> N
 
 def read_launch(path: Path) -> Launch:
     if not path.is_file():
-        raise LaunchError(
-            f"no launch file at {path}: expected the camera's own; start from a copy of one in launch/ such as oak.toml"
-        )
+        raise LaunchError(f"no launch file at {path}: expected the camera's own; copy one of launch/ such as oak.toml")
     return Launch.read(path)
 
 
@@ -171,7 +163,7 @@ def lens_of(path: Path) -> Intrinsics:
 
 
 def save_calibration(path: Path, *, lens: Intrinsics | None = None, pose: Pose | None = None) -> None:
-    """Write what was found to ``[input.calibration]`` of a launch file, which is left as it is otherwise."""
+    """Write a lens or a pose to ``[input.calibration]`` of a launch file, whose other content stays."""
     document = tomlkit.parse(path.read_text(encoding="utf-8"))
     section = document.setdefault("input", tomlkit.table()).setdefault("calibration", tomlkit.table())
     if lens:

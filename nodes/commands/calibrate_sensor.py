@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 SHORTEST_S = 10.0
 """Time in seconds that sensor and reference have in common, at least, in all recordings together."""
 FARTHEST_M, SHIFTS = 0.25, range(-15, 16)
-"""Largest mean distance of a sensor's joints from the reference's, once aligned, metres; shifts in time that are tried,
-in ticks of 30 Hz."""
+"""Largest mean distance of a sensor's aligned joints from the reference's, metres; tried shifts, ticks of 30 Hz."""
 
 
 @dataclass(frozen=True)
@@ -111,19 +110,13 @@ def _print_held_out(found: list[HeldOut]) -> None:
 
 
 class _Joints(NamedTuple):
-    """Of one recording."""
-
     stamps_ns: NDArray[np.int64]
     positions: Floats
     camera: Floats
 
 
 def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
-    """Recordings beside their references, on a grid of 30 Hz.
-
-    Raises:
-        LaunchError: they do not belong together; says what was expected.
-    """
+    """Recordings beside their references, on a grid of 30 Hz. Raises LaunchError if they do not belong together."""
     require_extra("train")
     from steadypose.training.recipes.sensor_bias import SensorTake
 
@@ -133,10 +126,7 @@ def read_takes(recording: Path, reference: Path) -> Iterator[SensorTake]:
         first = max(sensor.stamps_ns[0], truth.stamps_ns[0])
         last = min(sensor.stamps_ns[-1], truth.stamps_ns[-1])
         if last <= first:
-            raise LaunchError(
-                f"{observed_at} and {truth_at}: expected stamps of one clock, but they have no time in common; where "
-                "there is none, give both an fps and let both start in the same frame"
-            )
+            raise LaunchError(f"{observed_at} and {truth_at}: expected stamps of one clock, got no time in common")
         ticks = np.arange(first, last, 1e9 / FPS).astype(np.int64)
         common_s += (last - first) * 1e-9
         take = SensorTake(_person(observed_at, recording), _at(sensor, ticks), sensor.camera, _at(truth, ticks))
@@ -151,16 +141,13 @@ def _check_match(take: SensorTake, files: str) -> None:
     off = {shift: _mean_distance(take, shift) for shift in SHIFTS}
     best = min(off, key=lambda shift: off[shift])
     if abs(best) > 1 and off[best] < 0.7 * off[0]:
-        raise LaunchError(
-            f"{files}: expected stamps of one clock, but the reference fits best {abs(best) / FPS:.2f} s "
-            f"{'earlier' if best > 0 else 'later'} ({1e3 * off[best]:.0f} mm off instead of {1e3 * off[0]:.0f}); "
-            "correct the stamps of one of them"
-        )
+        when = f"{abs(best) / FPS:.2f} s {'earlier' if best > 0 else 'later'}"
+        better = f"{1e3 * off[best]:.0f} mm off instead of {1e3 * off[0]:.0f}"
+        raise LaunchError(f"{files}: expected stamps of one clock, but the reference fits best {when} ({better})")
     if not off[0] < FARTHEST_M:
-        raise LaunchError(
-            f"{files}: expected one person's joints within {FARTHEST_M:g} m on average, aligned, got {off[0]:.2f} m; "
-            "are both in metres and right-handed, in the order of their skeleton, and of the same moment?"
-        )
+        expected = f"expected one person's joints within {FARTHEST_M:g} m on average, aligned"
+        remedy = "are both in metres and right-handed, in the order of their skeleton, and of the same moment?"
+        raise LaunchError(f"{files}: {expected}, got {off[0]:.2f} m; {remedy}")
 
 
 def _mean_distance(take: SensorTake, shift: int) -> float:
@@ -186,10 +173,8 @@ def _pairs(recording: Path, reference: Path) -> list[tuple[Path, Path]]:
     alone = [str(path) for path, other in found if not other]
     if not pairs or alone:
         what = f"of {', '.join(alone[:4])} there is none" if alone else f"{recording} holds none"
-        raise LaunchError(
-            f"{reference}: expected a reference of the same name for each recording (rosbag2 directory, .mcap or "
-            f"{', '.join(FILES)}): {what}"
-        )
+        formats = f"rosbag2 directory, .mcap or {', '.join(FILES)}"
+        raise LaunchError(f"{reference}: expected one of the same name for each recording ({formats}): {what}")
     return pairs
 
 
@@ -205,7 +190,6 @@ def _person(path: Path, root: Path) -> str:
 
 
 def _joints(path: Path) -> _Joints:
-    """The one body of a recording, z up, in canonical joints."""
     stamps, positions, camera = [], [], np.zeros(3)
     for _, raw in open_recording(path):
         if not isinstance(raw, PoseRaw) or not raw.bodies:

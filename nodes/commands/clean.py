@@ -98,21 +98,16 @@ def clean(
     compile_missing(lambda line: terminal.print(printable(line)))
     if is_folder_of_recordings(source):
         if events is not None:
-            raise LaunchError(f"--events: expected a single recording as IN; {source} is a folder of them")
+            raise LaunchError(f"--events: expected a single recording as IN, got a folder of them, {source}")
         return clean_folder(source, out, table, jobs, ray, terminal)
     if ray or jobs is not None:
-        raise LaunchError(f"--{'ray' if ray else 'jobs'}: expected a folder of recordings as IN; {source} is one alone")
+        raise LaunchError(f"--{'ray' if ray else 'jobs'}: expected a folder of recordings as IN, got {source}, one")
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
         done = clean_recording(
-            source,
-            out,
-            table,
-            events=events,
-            replace=force,
-            began=lambda frames: progress.update(bar, total=frames),
-            advanced=lambda: progress.advance(bar),
-        )
+            source, out, table, events=events, replace=force,
+            began=lambda frames: progress.update(bar, total=frames), advanced=lambda: progress.advance(bar),
+        )  # fmt: skip
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
     terminal.print(f"{out}: {plural(done.frames, 'frame')}, {spent}")
     print_faults(terminal, done.refused, done.problems)

@@ -21,7 +21,7 @@ from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.offline import alternative_of, complete_source, load_completer
 from steadypose.nodes.settings import LaunchError
-from steadypose.nodes.sinks.plot.figure import PICTURES, draw_completion, save
+from steadypose.nodes.sinks.plot.figure import IMAGES, draw_completion, save
 from steadypose.nodes.sources.recording import NO_RIG, open_recording
 from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.timing.rate import FPS
@@ -81,7 +81,7 @@ def complete(
         check_poses_file(source, other, replace=force)
     if samples < 0:
         raise LaunchError(f"--samples: expected 0 or more, got {samples}")
-    if picture is not None and picture.suffix not in PICTURES:
+    if picture is not None and picture.suffix not in IMAGES:
         raise LaunchError(f"--picture: expected a name ending in .png, .svg or .pdf, got {picture}")
     one_thread()
     fill, uncertainty = load_completer(weights)

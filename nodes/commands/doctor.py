@@ -12,21 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from steadypose.nodes.commands.doctor_checks import (
-    INSTALL,
-    PROJECT,
-    Finding,
-    Verdict,
-    check_camera,
-    check_clock,
-    check_loops,
-    check_memory,
-    check_messages,
-    check_models,
-    check_processor,
-    check_streams,
-    check_webcam,
-)
+from steadypose.nodes.commands.doctor_checks import INSTALL, MACHINE, PROJECT, Finding, Verdict
 from steadypose.nodes.extras import EXTRAS, install_command
 from steadypose.nodes.settings import LaunchError
 
@@ -80,11 +66,7 @@ LISTEN_NS = 3_000_000_000
 def listen(launch_file: str, console: Console) -> int:
     """Listen for three seconds, where a launch file says, to the tracker and to the nodes' `diagnostics`.
 
-    Returns:
-        0 if nothing is wrong, otherwise 1; what is, is printed.
-
-    Raises:
-        LaunchError: the launch file cannot be used.
+    Prints the problems; returns 0 if there are none, otherwise 1. Raises LaunchError if the file cannot be used.
     """
     from steadypose.msgs.topics import DIAGNOSTICS, POSE_RAW
     from steadypose.msgs.transport import Subscriber
@@ -121,13 +103,9 @@ def listen(launch_file: str, console: Console) -> int:
     *_, found = [check.problems(clock.now_ns(), live=False) for _ in range(0, streams, AT_ONCE)]
     problems = [*found, *check_wire(refused)]
     if not frames and not problems:
-        problems.append(
-            error(
-                "no_source",
-                f"nothing came on {POSE_RAW} at {', '.join(addresses)}: expected a publisher there; start the tracker, "
-                "or name its launch file: steadypose doctor --live --launch FILE",
-            )
-        )
+        remedy = "start the tracker, or name its launch file: steadypose doctor --live --launch FILE"
+        text = f"nothing came on {POSE_RAW} at {', '.join(addresses)}: expected a publisher there; {remedy}"
+        problems.append(error("no_source", text))
     for problem in problems:
         console.print(f"{problem.level.name} {problem}", markup=False, soft_wrap=True)
     for cause, text in reported.items():
@@ -136,12 +114,10 @@ def listen(launch_file: str, console: Console) -> int:
     for source in {raw.source: None for raw in frames}:
         own = [raw for raw in frames if raw.source == source]
         newest = own[-1]
-        rate = len(own) / (LISTEN_NS / 1e9)
+        rate = f"{len(own) / (LISTEN_NS / 1e9):.1f} Hz"
         bodies = max(len(raw.bodies) for raw in own)
-        console.print(
-            f"{source!r}: {rate:.1f} Hz, skeleton {newest.skeleton!r}, bodies: {bodies}, frame "
-            f"{newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
-        )
+        sensor = f"frame {newest.frame_id!r}, {'calibrated' if newest.calibrated else 'not calibrated'}"
+        console.print(f"{source!r}: {rate}, skeleton {newest.skeleton!r}, bodies: {bodies}, {sensor}")
     if problems or reported:
         return 1
     console.print("no problems found")
@@ -218,16 +194,4 @@ def _missing(wanted: list[str]) -> list[str]:
     return missing
 
 
-CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    check_python,
-    check_packages,
-    check_processor,
-    check_memory,
-    check_clock,
-    check_messages,
-    check_loops,
-    check_models,
-    check_streams,
-    check_camera,
-    check_webcam,
-)
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (check_python, check_packages, *MACHINE)

@@ -25,7 +25,7 @@ INSTALL = install_command()
 
 
 class Verdict(Enum):
-    """How a check came out, as it is printed."""
+    """The result of a check, as it is printed."""
 
     GOOD = "[green]ok[/]"
     NOTE = "[yellow]note[/]"
@@ -36,7 +36,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found, and what to type to change it."""
+    """The result of one check, and what to type to change it."""
 
     what: str
     verdict: Verdict
@@ -59,7 +59,6 @@ UDEV_RULE = (
     f"""echo 'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{LUXONIS_USB}", MODE="0666"' | """
     "sudo tee /etc/udev/rules.d/80-movidius.rules && sudo udevadm control --reload-rules && sudo udevadm trigger"
 )
-
 DEVICES = Path("/dev")
 
 
@@ -93,11 +92,11 @@ def check_clock() -> Iterator[Finding]:
 
 def check_camera() -> Iterator[Finding]:
     """OAK cameras: none is fine."""
-    # its own warnings are about what is said here better
+    # its own warnings are about what is printed here, in other words
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
     try:
         import depthai
-    except ImportError:  # the extra that brings it is told of above
+    except ImportError:  # `check_packages` names the extra that installs it
         return
     devices = depthai.Device.getAllAvailableDevices()
     plugged = [file for file in Path("/sys/bus/usb/devices").glob("*/idVendor") if LUXONIS_USB in file.read_text()]
@@ -171,16 +170,16 @@ def check_loops() -> Iterator[Finding]:
     from steadypose.nodes.graph.loops import compile_missing
     from steadypose.prior import loop_cache
 
-    said: list[str] = []
+    lines: list[str] = []
     damaged = loop_cache.remove_damaged()
-    compile_missing(said.append)
+    compile_missing(lines.append)
     from steadypose.nodes.graph.trajectory_node import make_trajectory
 
     make_trajectory({})
     folder = loop_cache.writable()
     if folder is None or not loop_cache.is_complete():
         fix = "export XDG_CACHE_HOME=FOLDER, one that only you may write to"
-        yield noted("compiled loops", " ".join(said[-1:]), fix)
+        yield noted("compiled loops", " ".join(lines[-1:]), fix)
     else:
         mended = f"; {damaged} were damaged, and are compiled anew" if damaged else ""
         yield noted("compiled loops", f"in {folder}{mended}")
@@ -264,3 +263,9 @@ def check_streams() -> Iterator[Finding]:
         with RecordingReader(stream) as reader:
             seconds.append(reader.duration_s)
     yield noted("bundled streams", f"{len(seconds)} recordings, {sum(seconds):.0f} s in all")
+
+
+MACHINE = (
+    *(check_processor, check_memory, check_clock, check_messages, check_loops),
+    *(check_models, check_streams, check_camera, check_webcam),
+)

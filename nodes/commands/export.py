@@ -73,10 +73,9 @@ def export(
     if not source.exists():
         raise LaunchError(f"{source} does not exist: expected a recording with pose/world, or an .npz of 'clean'")
     if source.is_file() and source.suffix not in (".npz", ".mcap"):
-        raise LaunchError(
-            f"{source}: expected a recording with pose/world, or an .npz of 'clean', got {source.suffix or 'a file'}; "
-            f"clean it first: steadypose clean {source} {source.with_suffix('.npz').name}"
-        )
+        remedy = f"clean it first: steadypose clean {source} {source.with_suffix('.npz').name}"
+        got = source.suffix or "a file"
+        raise LaunchError(f"{source}: expected a recording with pose/world, or an .npz of 'clean', got {got}; {remedy}")
     if out.suffix in (".glb", ".vrma"):
         require_extra("export")
     # scipy, after it is known that there is something to do
@@ -162,9 +161,8 @@ def retarget(
     stamp_ns, root, joints, stands = (np.array(column) for column in zip(*poses, strict=True))
     with unfinished(out) as part:
         if out.suffix == ".npz":
-            np.savez(
-                part, stamp_ns=stamp_ns, root=root, joints=joints, stands=stands, joint_names=np.array(robot.joints)
-            )
+            names = np.array(robot.joints)
+            np.savez(part, stamp_ns=stamp_ns, root=root, joints=joints, stands=stands, joint_names=names)
         else:
             table = np.column_stack([(stamp_ns - stamp_ns[0]) / 1e9, root, joints])
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")

@@ -88,7 +88,7 @@ def fit(
     try:
         with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
             if two_d:
-                frames, tracks, lines = _fit_picture(source, out, model, folder, progress)
+                frames, tracks, lines = _fit_key_points(source, out, model, folder, progress)
             else:
                 frames, tracks, lines = _fit_poses(source, out, model, folder, delay, progress)
         if shape is not None:
@@ -107,8 +107,9 @@ def fit(
 def _fit_poses(
     source: Path, out: Path, model: Any, folder: Path, delay: int, progress: Progress
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
-    """Fit 3D joints, initialised by the nodes' own pipelines; returns the number of frames, what was fitted, and lines
-    to print."""
+    """Fit 3D joints, initialised by the nodes' own pipelines: the number of frames, what was fitted, and lines to
+    print.
+    """
     from steadypose.prior.fit.windows import window_bounds
 
     bar = progress.add_task(source.name, total=None)
@@ -134,7 +135,7 @@ def _line(fit: Fit) -> str:
     return f"{who}: floor at {fit.track.ground[:, 0].mean():.3f} m{far}{kept}"
 
 
-def _fit_picture(
+def _fit_key_points(
     source: Path, out: Path, model: Any, folder: Path, progress: Progress
 ) -> tuple[int, list[FittedTrack | None], list[str]]:
     """Fit key points of one camera; returns as `_fit_poses`."""
@@ -172,7 +173,6 @@ def _write_smpl(out: Path, shape: Any, tracks: Sequence[FittedTrack | None]) -> 
 
 
 def _explain(out: Path, fits: Sequence[tuple[int, NDArray[np.int64], Floats, Any]], unit: str) -> None:
-    """Write the residuals, as arrays and as a plot."""
     arrays: dict[str, Any] = {"joint_names": np.array(JOINTS), "unit": np.array(unit)}
     for number, (body, stamps, misfit, track) in enumerate(fits):
         arrays |= {f"{number}/body_id": np.array(body), f"{number}/stamp_ns": stamps, f"{number}/misfit": misfit}

@@ -17,14 +17,7 @@ from steadypose.msgs.topics import TOPICS
 from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, JointState, Message, PoseClean, PoseEvents, PoseRaw
 from steadypose.nodes.checks.problem import observed
-from steadypose.nodes.commands.inspect import (
-    Address,
-    LaunchFile,
-    Rate,
-    endpoints_of,
-    recording_at,
-    subscribe,
-)
+from steadypose.nodes.commands.inspect import Address, LaunchFile, Rate, endpoints_of, recording_at, subscribe
 from steadypose.nodes.commands.output import plural
 from steadypose.nodes.driving import CHECKED, Diagnosis
 from steadypose.nodes.graph.clock import POLL_S
@@ -38,9 +31,7 @@ INFO_S = 2.0
 
 
 def info(
-    target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")],
-    launch: LaunchFile = None,
-    endpoints: Address = (),
+    target: Annotated[str, tyro.conf.arg(metavar="TOPIC|RECORDING")], launch: LaunchFile = None, endpoints: Address = ()
 ) -> int:
     """Describe a recording or a file of poses, or list who publishes a topic.
 
@@ -76,7 +67,7 @@ def info(
 
 
 class _Contents:
-    """What messages speak of, and when they came, in seconds."""
+    """A summary of messages, and when they came, in seconds."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -148,11 +139,7 @@ def _listen(subscriber: Subscriber) -> _Contents:
 
 
 def describe_file(path: Path) -> Iterator[str]:
-    """Lines that say what it holds, and what is probably wrong with it.
-
-    Raises:
-        LaunchError, NpzError, CsvError, MotionError: it holds no poses.
-    """
+    """Lines with the content of a file of poses, and its probable faults. Raises as `open_recording`."""
     size = f"{path.stat().st_size / 1e6:.2f} MB"
     if path.suffix == ".npz":
         arrays = read_arrays(path)

@@ -1,4 +1,4 @@
-"""``steadypose echo`` and ``steadypose hz``: what a topic or a recording says, and how often.
+"""``steadypose echo`` and ``steadypose hz``: the messages of a topic or a recording, and their rate.
 
 A topic is looked for where this machine's nodes publish it; ``--launch`` takes the addresses (and keys) of a launch
 file in place of these, ``--endpoint`` an address of one's own. Nothing here holds the nodes up.
@@ -149,9 +149,8 @@ def _lines(topic: str, message: Message) -> Iterator[str]:
             yield f"  {raw.id}: {seen}, their centre {_vector(centre)} in the sensor's frame"
         return
     for body in message.bodies:
-        states = ", ".join(
-            f"{(body.state == state).sum()} {state.name.lower()}" for state in JointState if (body.state == state).any()
-        )
+        counts = {state.name.lower(): (body.state == state).sum() for state in JointState}
+        states = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
         spread = f"sigma up to {body.sigma.max() * 100:.1f} cm"
         if isinstance(body, WorldBody):
             speed = float(np.linalg.norm(body.root_velocity))
@@ -253,10 +252,8 @@ def hz(
 
 
 class Rate:
-    """How often something came: mean rate in Hz, and the intervals between in seconds; NaN for fewer than two times.
-
-    Args:
-        times: in seconds, in the order they came.
+    """The rate of something that came at ``times``, seconds, in order: mean in Hz, intervals in seconds; NaN for fewer
+    than two.
     """
 
     def __init__(self, times: Sequence[float]) -> None:
@@ -286,7 +283,7 @@ class Rate:
 def measure(arrivals: Iterator[float], window_s: float, count: int | None = None) -> Iterator[Rate]:
     """The rate over the last ``window_s`` seconds, once a second while something arrives, and at the end.
 
-    ``arrivals`` are rising times in seconds, given as they come; ``count`` is their number after which to end.
+    ``arrivals`` are rising times in seconds, given as they come. The measurement ends after ``count`` of them.
     """
     recent: deque[float] = deque()
     reported_at = None

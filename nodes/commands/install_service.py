@@ -109,7 +109,6 @@ class Service:
     """besides the user's own, of those that this machine has"""
 
     def unit(self) -> str:
-        """The text of the unit."""
         return UNIT.format(
             mark=MARK,
             launch=quoted(self.launch),
@@ -121,12 +120,9 @@ class Service:
         )
 
     def check(self, launch: Launch, *python: Path) -> None:
-        """Find what a service could not read, or write, before it fails at every boot.
+        """Raise LaunchError for what a service could not read, or write: it would fail at every boot.
 
         ``launch`` is the launch file as it is read; ``python`` are folders that the command needs besides its own.
-
-        Raises:
-            LaunchError: names it, and what to do.
         """
         if not re.fullmatch(r"[a-z_][a-z0-9_-]{0,30}", self.name):
             raise LaunchError(f"--name: expected small letters, digits, - and _, got {self.name!r}")
@@ -138,23 +134,17 @@ class Service:
                     " or give the user whose home it is with --user"
                 )
         recording = launch.settings(RecorderSettings).directory if "recorder" in launch.nodes else ""
-        state = _state(self.name)
+        state, run, sockets = _state(self.name), f"/run/{self.name}", launch.transport.directory
         if recording and not _is_in(Path(recording), (str(state),)):
-            raise LaunchError(
-                f"[recorder] directory is {recording}: expected one in {state}, for a service writes nowhere else"
-            )
-        if launch.transport.directory and not _is_in(Path(launch.transport.directory), (f"/run/{self.name}",)):
-            raise LaunchError(
-                f"[transport] directory is {launch.transport.directory}: expected none, or one in /run/{self.name}"
-            )
+            raise LaunchError(f"[recorder] directory: expected one in {state}, as for all it writes, got {recording}")
+        if sockets and not _is_in(Path(sockets), (run,)):
+            raise LaunchError(f"[transport] directory: expected none, or one in {run}, got {sockets}")
         sections = [launch, *(section for section in launch.sections.values() if is_dataclass(section))]
         for path in (Path(self.launch), *(path for section in sections for path in paths_in(section))):
             for folders, where in ((HOMES, "a home"), (TEMPORARY, "a folder of temporary files")):
                 if (folders is TEMPORARY or self.is_new_user) and _is_in(path, folders):
-                    raise LaunchError(
-                        f"{path} is in {where}, which the service does not see: copy the launch file, and what it "
-                        f"names, to /etc/{self.name}"
-                    )
+                    remedy = f"copy the launch file, and what it names, to /etc/{self.name}"
+                    raise LaunchError(f"{path} is in {where}, which the service does not see: {remedy}")
 
 
 def _is_in(path: Path, folders: tuple[str, ...]) -> bool:
@@ -170,8 +160,6 @@ def quoted(text: str) -> str:
 UNITS = Path("/etc/systemd/system")
 BOOTED = Path("/run/systemd/system")
 """there where systemd runs this machine (sd_booted(3))"""
-
-
 Step = tuple[str, Callable[[], object]]
 """One thing that is done: how it is printed, and a function that does it."""
 
@@ -218,28 +206,24 @@ def install_service(
     if not (uninstall or dry_run):
         # as root, so that all users find them beside the package
         compile_missing(lambda line: console.print(line, markup=False))
-    for said, act in steps:
-        console.print(f"+ {said}", markup=False)
+    for step, act in steps:
+        console.print(f"+ {step}", markup=False)
         try:
             if not dry_run:
                 act()
         except (OSError, subprocess.CalledProcessError) as error:
-            raise LaunchError(
-                f"`{said}` failed ({error}); what was done before stays: --uninstall undoes it"
-            ) from error
+            raise LaunchError(f"`{step}` failed ({error}); --uninstall undoes what was done before") from error
     if uninstall and _state(name).exists():
         console.print(f"{_state(name)} is kept: remove it, and user {name}, if you do not need its recordings")
     elif not (uninstall or dry_run or BOOTED.exists()):
         console.print("systemd does not run here: the service starts at the next boot that it runs")
     elif not (uninstall or dry_run):
-        console.print(
-            f"it runs: `systemctl status {name}`, `journalctl -fu {name}`, /run/{name}/steadypose/health.json"
-        )
+        where = f"`systemctl status {name}`, `journalctl -fu {name}`, /run/{name}/steadypose/health.json"
+        console.print(f"it runs: {where}")
     return 0
 
 
 def _service(launch: str, name: str, user: str) -> Service:
-    """Raises LaunchError if a service could not run so."""
     if user and not _has_user(user):
         raise LaunchError(f"--user: there is no user {user!r}; leave it out to have one made")
     file = find(launch)

@@ -1,4 +1,4 @@
-"""What commands put out: files, never over their input, and whole or not at all; and text of others on a terminal.
+"""The output of commands: files, never over their input, and whole or not at all; and text of others on a terminal.
 
 One recording is cleaned here, for `clean` and for each process of a folder's.
 """
@@ -72,7 +72,7 @@ def check_format(out: Path) -> None:
     if out.suffix in OTHER_FORMATS:
         raise LaunchError(
             f"{out}: expected .npz or .csv for arrays, or a name without ending for a recording, got {out.suffix}; "
-            "`steadypose export` makes a .bvh, .glb, .vrma or .trc of an .npz"
+            "`steadypose export` makes .bvh, .glb, .vrma and .trc"
         )
 
 
@@ -108,11 +108,10 @@ def check_replaceable(out: Path, *, replace: bool, is_file: bool) -> None:
 
 @contextmanager
 def unfinished(out: Path) -> Iterator[Path]:
-    """Where to write what becomes ``out`` after the block: beside it, under the same name, because a recording's file
-    has its name.
+    """Where to write what becomes ``out`` after the block: beside it, under the same name, which a recording's file has
+    too.
 
-    Raises:
-        LaunchError: the folder cannot be written to, or the disk is full, or another call is writing ``out``.
+    Raises LaunchError if the folder cannot be written to, the disk is full, or another call is writing ``out``.
     """
     folder = out.with_name(f".{out.name}.part")
     mark = folder / ".steadypose"
@@ -144,9 +143,7 @@ def _lock(held: IO[str], out: Path) -> None:
     try:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise LaunchError(
-            f"{out}: another steadypose is writing it: wait until it has ended, or write elsewhere"
-        ) from error
+        raise LaunchError(f"{out}: another steadypose is writing it: wait for it, or write elsewhere") from error
     except OSError:
         pass  # a file system without locks
 
@@ -156,7 +153,7 @@ def write_output(
 ) -> None:
     """Write arrays or messages, as the name's ending says; the output is there whole, or not at all.
 
-    Messages are logged as the recorder logs them. A recording that is there is replaced.
+    Messages are logged as by the recorder. A recording that is there is replaced.
     """
     with unfinished(out) as part:
         if out.suffix == ".csv":
@@ -214,20 +211,16 @@ def clean_recording(
     began: Callable[[int], None] = lambda frames: None,
     advanced: Callable[[], None] = lambda: None,
 ) -> Cleaned:
-    """Clean one recording. The output is there whole, or not at all.
+    """Clean a recording or file of poses to a recording, .npz or .csv, and the .csv ``events``; whole, or not at all.
 
     Args:
-        source: a recording or file of poses.
-        out: the recording to make, or .npz or .csv.
         settings: ``[prior]``, ``[trajectory]`` and, if it has them, ``[skeletons]`` and ``[events]`` of a launch file;
-            ``rig`` is what a file of motion does not say.
-        events: .csv to write the events to as well.
+            and ``rig``, for what a file of motion lacks.
         replace: whether what is at ``out`` may be replaced, if it is a recording or an .npz.
         began: called with the number of frames.
         advanced: called after each.
 
-    Raises:
-        LaunchError, RecordingError, NpzError: the input cannot be used, or the output not be made.
+    Raises LaunchError, RecordingError or NpzError if the input cannot be used, or the output not be made.
     """
     from steadypose.nodes.driving import OfflineRun  # 95 MB of numba: not for commands that only print
 

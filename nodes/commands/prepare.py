@@ -78,7 +78,7 @@ def prepare(
         read = partial(read_own, description=describe(read_toml(rig)))
         sources = [(path, replace(s, read=read) if s.name == "own" else s) for path, s in sources]
     folder = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):  # told now, not after minutes
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):  # now, not after minutes
         raise LaunchError(f"--out: cannot write to {out}: expected {folder} to be a folder that can be written to")
     found: list[Prepared | Dropped] = []
     with Progress(console=console) as progress:
@@ -104,11 +104,7 @@ def prepare(
 
 
 def find_sources(mocap: Path) -> list[tuple[Path, DataSet]]:
-    """Which files hold which known data set, in the order of preparation.
-
-    Raises:
-        LaunchError: nothing there, or nothing known.
-    """
+    """The files of each known data set, in the order of preparation. Raises LaunchError if there are none."""
     if not mocap.exists():
         raise LaunchError(f"expected a folder or archive of motion capture, '{mocap}' does not exist")
     candidates = [mocap] if mocap.is_file() else [*sorted(mocap.iterdir()), mocap]
@@ -173,8 +169,8 @@ def _read(path: Path, data_set: DataSet, speeds: Sequence[float], progress: Prog
 
     def advance(fraction: float) -> None:
         kept = [part.clip.seconds for part in found if isinstance(part, Prepared)]
-        told = f"{len(kept)} recordings, {sum(kept) / 60:.1f} min, {len(found) - len(kept)} dropped"
-        progress.update(task, completed=fraction, description=f"{path.name}: {told}")
+        so_far = f"{len(kept)} recordings, {sum(kept) / 60:.1f} min, {len(found) - len(kept)} dropped"
+        progress.update(task, completed=fraction, description=f"{path.name}: {so_far}")
 
     try:
         for clip in data_set.read(path, advance):
@@ -193,7 +189,7 @@ def _prepared(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> list[Pr
 
 
 def _played(clip: Clip, data_set: DataSet, speeds: Sequence[float]) -> Iterator[Prepared | Dropped]:
-    """What a recording gives: held out, itself; in training, once at each speed."""
+    """A recording at each speed; one that is held out at its own alone."""
     split = data_set.split(clip)
     for speed in speeds if split == "train" else (1.0,):
         if (played := at_speed(clip, speed)) is not None:

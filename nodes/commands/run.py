@@ -36,7 +36,7 @@ from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 LINE_NS = 5_000_000_000
 """between lines where there is no terminal for a table"""
 REPORT_NS = 1_000_000_000
-"""between two times the health file is written"""
+"""between writes of the health file"""
 REPLAY = "replay"
 STALL_NS = 15_000_000_000
 """without progress after the source has ended, until the run is given up: a message was lost on the way"""
@@ -78,18 +78,16 @@ def run(
         overrides += ['input.source="webcam"', f"input.webcam.video={_toml(input.resolve())}"]
         overrides.append("transport.lossless=true")  # a video can wait
     elif input is not None:
-        overrides += [
-            'input.source="recording"',
-            f"input.recording={_toml(located(str(input), Path.cwd(), STREAMS).resolve())}",
-        ]
+        recording = located(str(input), Path.cwd(), STREAMS).resolve()
+        overrides += ['input.source="recording"', f"input.recording={_toml(recording)}"]
     if rate is not None:
         overrides.append(f"input.rate={rate}")
     if loop:
         overrides.append("input.loop=true")
     if record is not None:
         overrides.append(f"recorder.directory={_toml(record.resolve())}")
-    nodes = Launch.read(launch, overrides).nodes
-    nodes = [*nodes, *(name for name, asked in (("recorder", record), ("viewer", view)) if asked and name not in nodes)]
+    nodes = [*Launch.read(launch, overrides).nodes]
+    nodes += [name for name, wanted in (("recorder", record), ("viewer", view)) if wanted and name not in nodes]
     overrides.append(f"nodes={json.dumps(nodes)}")
     settled = Launch.read(launch, overrides)
     # a log file has no width, and a table cut to 80 columns says little
@@ -107,9 +105,7 @@ def run(
     with run_lock(settled) as writes_health:
         if COMPILED & {*nodes}:
             compile_missing(lambda line: console.print(printable(line), markup=False, highlight=False, soft_wrap=True))
-        identity = secrets.token_hex(8)
-        watched = _Run(settled, arguments, console, Clock(), identity=identity, writes_health=writes_health)
-        return watched.watch()
+        return _Run(settled, arguments, console, Clock(), secrets.token_hex(8), writes_health).watch()
 
 
 def _toml(path: Path) -> str:
@@ -118,7 +114,7 @@ def _toml(path: Path) -> str:
 
 
 def _check(launch: Launch) -> None:
-    """Find here, before any process starts, what every one of them would stumble over."""
+    """Find before any process starts what would stop one of them."""
     for name in launch.nodes:
         if extra := NODES[name].extra:
             require_extra(extra)
@@ -130,21 +126,10 @@ class _Run:
     """One run: the processes, their diagnostics, and when it is over."""
 
     def __init__(
-        self,
-        launch: Launch,
-        arguments: list[str],
-        console: Console,
-        clock: Clock,
-        *,
-        identity: str = "",
-        writes_health: bool = True,
+        self, launch: Launch, arguments: list[str], console: Console, clock: Clock, identity: str, writes_health: bool
     ) -> None:
-        self._launch = launch
-        self._arguments = arguments
-        self._console = console
-        self._clock = clock
-        self._id = identity
-        self._writes_health = writes_health
+        self._launch, self._arguments, self._console, self._clock = launch, arguments, console, clock
+        self._id, self._writes_health = identity, writes_health
         self._diagnostics: dict[str, Diagnostics] = {}
         self._ledger = Ledger(launch)
         self._problems: dict[str, set[str]] = {}
@@ -152,8 +137,7 @@ class _Run:
         waited_for = frozenset[str]().union(*map(launch.reliable_subscribers, POSE_NODES))
         self._required = {name for name in launch.nodes if not NODES[name].optional or name in waited_for}
         self._without: list[str] = []
-        self._progress_ns = clock.monotonic_ns()
-        self._printed_ns = clock.monotonic_ns()
+        self._progress_ns = self._printed_ns = clock.monotonic_ns()
         self._reported_ns = 0
         self._ready = False
 
@@ -208,7 +192,7 @@ class _Run:
         return status
 
     def _report(self, supervisor: Supervisor) -> None:
-        """Say how things are to who is no person: once a second, a file and systemd."""
+        """Report the state once a second, to a file and to systemd."""
         if self._clock.monotonic_ns() - self._reported_ns < REPORT_NS:
             return
         self._reported_ns = self._clock.monotonic_ns()
@@ -294,7 +278,7 @@ class _Run:
         return losses(self._diagnostics["recorder"], *LOSSES) if "recorder" in self._diagnostics else ""
 
     def _not_through(self) -> str:
-        """What a launch that is to lose nothing has lost, or could not read; empty if nothing."""
+        """The losses of a launch that is to lose nothing, also of what could not be read; empty if none."""
         if not self._launch.transport.lossless:
             return ""
         found = {

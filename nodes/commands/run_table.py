@@ -14,7 +14,7 @@ from steadypose.nodes.graph.topology import NODES
 from steadypose.nodes.settings import printable
 
 LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
-"""of the table's columns: the first to go where they do not fit"""
+"""columns that are left out where not all fit, in this order"""
 WIDTH = 80
 """of `lines`, characters"""
 
@@ -22,10 +22,10 @@ WIDTH = 80
 def table(
     nodes: list[str], diagnostics: dict[str, Diagnostics], supervisor: Supervisor, width: int, *, summary: bool = False
 ) -> Group:
-    """A row for each node: how fast, how late, what went wrong, what it weighs.
+    """A row for each node: rate, latency, losses and memory.
 
-    A column in which there is nothing to say is left out, and of the others those that fit no more into ``width``
-    characters. The rates of a ``summary`` are over all the run.
+    Empty columns are left out, and then those that do not fit into ``width`` characters. The rates of a ``summary`` are
+    over the whole run.
     """
     rows, notes = [], []
     for name in nodes:
@@ -68,10 +68,8 @@ def table(
     grid = Table(box=None, header_style="bold", pad_edge=False)
     shown = [heading for heading in rows[0] if any(row[heading] not in ("", "0") for row in rows)]
     for least in LEAST:
-        wide = (
-            max(len(line) for cell in (key, *(row[key] for row in rows)) for line in cell.split("\n")) for key in shown
-        )
-        if sum(wide) + 2 * len(shown) <= width:
+        cells = ([key, *(row[key] for row in rows)] for key in shown)
+        if sum(max(map(len, "\n".join(column).split("\n"))) + 2 for column in cells) <= width:
             break
         shown = [heading for heading in shown if heading != least]
     for heading in shown:

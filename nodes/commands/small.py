@@ -114,9 +114,9 @@ def plot(
         RecordingError: the recording cannot be read.
         PlotError: there is nothing to draw, no such body, or nowhere to write to.
     """
-    import matplotlib  # noqa: F401  (first of all: what is not installed is said before anything else)
+    import matplotlib  # noqa: F401  (first, so that a missing extra is reported before anything else)
 
-    from steadypose.nodes.sinks.plot.figure import check_picture, draw, save
+    from steadypose.nodes.sinks.plot.figure import check_image, draw, save
     from steadypose.nodes.sinks.plot.history import PlotError, history_of_path
 
     if recording.is_dir() and not any(recording.glob("*.mcap")) and (inside := {*recording.glob("*/*.mcap")}):
@@ -128,7 +128,7 @@ def plot(
     if video is not None:
         from steadypose.nodes.sinks.plot.video import VIDEOS, write_overlay, write_video
 
-        check_picture(video, VIDEOS)
+        check_image(video, VIDEOS)
         with unfinished(video) as part:
             if over is not None:
                 frames = write_overlay(recording, over, part, body)
@@ -137,7 +137,7 @@ def plot(
         print(f"wrote {video}: {plural(frames, 'frame')}")
         return
     output = output or Path(f"{recording.resolve().stem}.png")
-    check_picture(output)
+    check_image(output)
     with unfinished(output) as part:
         save(draw(history_of_path(recording), body), part)
     print(f"wrote {output}")

@@ -41,8 +41,7 @@ def train(
     model: Model,  # pyright: ignore[reportInvalidTypeForm]
     data: Path = Path("data/prepared.npz"),
     weights: Annotated[
-        Literal["default", "research", "kinect_v2"] | None,
-        tyro.conf.arg(metavar="{default,research,kinect_v2}"),
+        Literal["default", "research", "kinect_v2"] | None, tyro.conf.arg(metavar="{default,research,kinect_v2}")
     ] = None,
     runs: Path = Path("runs"),
     iterations: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
@@ -112,10 +111,9 @@ def train(
 
 
 def little_data(path: Path, weights: str, start: str | None = None) -> str:
-    """What to say of prepared motion that is too little for a set of weights; empty if it is enough, or another file.
+    """A warning of too little prepared motion for a set of weights; empty if it is enough, or another file.
 
-    Raises:
-        LaunchError: it is too little to begin with.
+    Raises LaunchError if it is too little to begin with.
     """
     if not zipfile.is_zipfile(path):
         return ""
@@ -127,7 +125,5 @@ def little_data(path: Path, weights: str, start: str | None = None) -> str:
     had = f"{path} has {minutes:.1f} minutes of motion to train the {weights!r} weights on"
     if minutes < LEAST_MIN:
         raise LaunchError(f"{had}: expected at least {LEAST_MIN:g}, better {ENOUGH_MIN:g}; prepare more recordings")
-    more = f"expected {ENOUGH_MIN:g}; prepare more recordings" + (
-        "" if start else ", or fine-tune with --start default"
-    )
+    more = f"expected {ENOUGH_MIN:g}; prepare more recordings{'' if start else ', or fine-tune with --start default'}"
     return f"{had}, which is little: {more}" if minutes < ENOUGH_MIN else ""

@@ -198,7 +198,7 @@ def test_recordings_are_told_from_folders_of_them(tmp_path: Path) -> None:
     ("in", "used", {}, "manifest.jsonl of an earlier call"),
     ("in", "out", {"jobs": 0}, "expected 1 or more, got 0"),
     ("in", "out", {"jobs": 2, "ray": True}, "Ray decides"),
-    ("empty", "out", {}, "expected recordings"),
+    ("empty", "out", {}, "expected rosbag2 directories"),
     ("twice", "out", {}, "would both become"),
     ("in/a.npz", "out", {"jobs": 2}, "--jobs: expected a folder"),
 ])  # fmt: skip

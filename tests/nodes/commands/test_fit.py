@@ -124,7 +124,7 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
 @pytest.mark.parametrize(("source", "out", "says"), [
     ("nowhere.npz", "out.npz", "does not exist"),
     ("in.npz", "keys.npz", "--force"),
-    ("empty.npz", "out.npz", "found nobody"),
+    ("empty.npz", "out.npz", "got nobody"),
     ("keys.npz", "out", "expected an .npz"),
 ])  # fmt: skip
 def test_what_cannot_be_done_is_said(source: str, out: str, says: str, seen, pictured, tmp_path, capsys) -> None:

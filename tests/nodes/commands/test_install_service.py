@@ -63,8 +63,8 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     ({}, {"transport.keys": "/home/a/keys"}, "/home/a/keys is in a home"),
     ({}, {"input.webcam.video": "/home/a/in.mp4"}, "/home/a/in.mp4 is in a home"),
     ({"name": "../x"}, {}, "--name: expected small letters"),
-    ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory .*/var/lib/poses"),
-    ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory .*/run/poses"),
+    ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory: .*/var/lib/poses"),
+    ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory: .*/run/poses"),
 ])  # fmt: skip
 def test_what_a_service_could_not_do_is_said(changed: dict[str, object], settings: dict[str, str], said: str) -> None:
     launch = Launch.read("replay", [f"{key}={value}" for key, value in settings.items()])

@@ -139,7 +139,7 @@ def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
     (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
     (1, "nowhere/picture.png", {}, "no directory; make it first"),
     (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
-    (0, "picture.png", {}, "expected at least one body, found none; `steadypose info`"),
+    (0, "picture.png", {}, "expected at least one body, got none; see `steadypose info`"),
 ])  # fmt: skip
 def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
     recording = recorded(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
@@ -290,11 +290,12 @@ def test_arrays_have_clean_alone(tmp_path: Path, cleaned: list[PoseClean], video
 
 def test_another_video_is_refused(tmp_path: Path, cleaned: list[PoseClean], video: Path) -> None:
     later = [dataclasses.replace(message, stamp_ns=message.stamp_ns + 10**10) for message in cleaned]
-    with pytest.raises(PlotError, match=r"clean .*video\.avi OUT' makes: .* ends after 0\.7 s, these begin at 10\.0 s"):
+    expected = r"clean .*video\.avi OUT' makes, .* ends after 0\.7 s, and these stamps begin at 10\.0 s"
+    with pytest.raises(PlotError, match=expected):
         plot(record(tmp_path / "bag", later, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     for message in cleaned:
         message.bodies[0].positions[:] = message.bodies[0].positions[:, [2, 0, 1]] * [1.0, 1.0, -1.0]
-    with pytest.raises(PlotError, match="none of these lies within its images"):
+    with pytest.raises(PlotError, match="none lies within its images"):
         plot(record(tmp_path / "world", cleaned, POSE_CLEAN), video=tmp_path / "out.mp4", over=video)
     assert not (tmp_path / "out.mp4").exists()
     with pytest.raises(PlotError, match="over: expected a video that OpenCV can read"):

@@ -127,7 +127,7 @@ def news(node: str, ended: str = "", level: Level = Level.OK, **values: str) -> 
 @pytest.fixture
 def watched(clock: VirtualClock, make_launch: Callable[..., Launch]) -> tuple[_Run, Any]:
     launch = make_launch(nodes=str(NODES).replace("'", '"'))
-    return _Run(launch, [], Console(quiet=True), clock), Processes(*NODES)
+    return _Run(launch, [], Console(quiet=True), clock, "", True), Processes(*NODES)
 
 
 NODES = ["pose_input", "prior", "trajectory", "recorder"]
@@ -170,7 +170,7 @@ def test_what_was_lost_on_the_way_is_no_success(watched: tuple[_Run, Any]) -> No
 
 
 def test_what_another_runs_nodes_say_is_not_believed(clock: VirtualClock, make_launch: Callable[..., Launch]) -> None:
-    run = _Run(make_launch(nodes='["prior"]'), [], Console(quiet=True), clock, identity="this")
+    run = _Run(make_launch(nodes='["prior"]'), [], Console(quiet=True), clock, "this", True)
     processes: Any = Processes("prior")
     for identity in ("another", ""):
         topic, said = news("prior")
@@ -222,7 +222,7 @@ def test_the_table_leaves_out_what_does_not_fit_into_a_terminal() -> None:
 
 def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
     console = Console(width=140, record=True)
-    run = _Run(make_launch(nodes='["prior"]'), [], console, clock)
+    run = _Run(make_launch(nodes='["prior"]'), [], console, clock, "", True)
     processes: Any = Processes("prior")
     for _ in range(2):
         run._receive(news("prior", level=Level.ERROR, problem__stamps_zero="stamp is 0: expected more"), processes)
