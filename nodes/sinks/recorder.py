@@ -105,8 +105,7 @@ def free_directory(launch: Launch) -> Path | None:
     wanted = Path(directory)
     if not directory or not os.path.lexists(wanted):
         return None
-    replays = "pose_input" in launch.nodes and not isinstance(open_input(launch), LiveSource)
-    if _is_recording(wanted) and not replays:
+    if _is_recording(wanted) and ("pose_input" not in launch.nodes or isinstance(open_input(launch), LiveSource)):
         return None
     others = (wanted.with_name(f"{wanted.name}-{number}") for number in itertools.count(2))
     return next(other for other in others if not os.path.lexists(other))
