@@ -37,9 +37,9 @@ FILE_RATIO_FROM = 2**24
 MIN_RECORD = 31
 """Size of a message record without content, bytes. It bounds the plausible number of records in a chunk."""
 BROKEN = (
-    *(ValueError, KeyError, EOFError, OSError, RuntimeError, OverflowError, MemoryError),
-    *(McapError, struct.error, zstandard.ZstdError),
-)
+    McapError, struct.error, zstandard.ZstdError, ValueError, KeyError, EOFError, OSError, RuntimeError, OverflowError,
+    MemoryError,
+)  # fmt: skip
 """Exceptions that the libraries raise for bytes that are not MCAP."""
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")

@@ -98,7 +98,7 @@ class RecordingReader(Closing):
         """
         wanted = set(TOPICS if topics is None else topics)
         if unknown := wanted - TOPICS.keys():
-            raise ValueError(f"topics: expected of {', '.join(TOPICS)}, got {', '.join(sorted(unknown))}")
+            raise ValueError(f"topics: expected some of {', '.join(TOPICS)}, got {', '.join(sorted(unknown))}")
         names = wanted | {f"/{topic}" for topic in wanted}
         parts = (part.messages(names, start_ns) for part in self._parts)
         try:

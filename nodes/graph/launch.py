@@ -67,7 +67,7 @@ class Launch(_EveryLaunch):
             raise LaunchError(f"nodes: expected one or more of {', '.join(NODES)}, got none")
         for node in self.nodes:
             if node not in NODES:
-                raise LaunchError(f"nodes: expected of {', '.join(NODES)}, got {node!r}{nearest(node, NODES)}")
+                raise LaunchError(f"nodes: expected some of {', '.join(NODES)}, got {node!r}{nearest(node, NODES)}")
         for node, count in Counter(self.nodes).items():
             if count > 1:
                 raise LaunchError(f"nodes names {node!r} {count} times: expected each node once")

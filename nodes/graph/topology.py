@@ -224,7 +224,7 @@ class TransportSettings:
         for node, address in self.endpoints.items():
             if node not in NODES:
                 got = f"{node!r}{nearest(node, NODES)}"
-                raise LaunchError(f"[transport.endpoints] expected of {', '.join(NODES)}, got {got}")
+                raise LaunchError(f"[transport.endpoints] expected some of {', '.join(NODES)}, got {got}")
             if (other := taken.setdefault(address, node)) != node and not address.endswith(":*"):
                 got = f"{address}, as for {other}"
                 raise LaunchError(f"[transport.endpoints] {node}: expected an address of its own, got {got}")

@@ -68,7 +68,7 @@ class RecorderSettings:
         for topic in self.topics:
             if topic not in TOPICS:
                 got = f"{topic!r}{nearest(topic, TOPICS)}"
-                raise LaunchError(f"[recorder] topics: expected of {', '.join(TOPICS)}, got {got}")
+                raise LaunchError(f"[recorder] topics: expected some of {', '.join(TOPICS)}, got {got}")
         for name in ("split_mb", "split_s", "keep_mb", "free_mb", "sync_s"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise LaunchError(f"[recorder] {name}: expected 0 or more, got {getattr(self, name)}")
