@@ -110,7 +110,7 @@ def test_seek_and_topics_can_be_chosen(whole: Path, frame: int):
         assert list(reader.messages(start_ns=reader.end_ns + 1)) == []
         some = list(reader.messages(chosen, start_ns=start))
         assert some == [recorded for recorded in found if recorded.topic in chosen]
-        with pytest.raises(ValueError, match=r"expected of pose/raw, .*, got pose/row"):
+        with pytest.raises(ValueError, match=r"expected some of pose/raw, .*, got pose/row"):
             next(reader.messages(["pose/row"]))
 
 

@@ -54,7 +54,7 @@ class Ros2BridgeSettings:
         if not self.world_frame or self.world_frame.startswith("/"):
             raise LaunchError(f"[ros2] world_frame: expected a frame's name without a slash, got {self.world_frame!r}")
         if self.namespace and not _NAMESPACE.fullmatch(self.namespace):
-            raise LaunchError(f"[ros2] namespace: expected a name such as robot or fleet/robot1, got {self.namespace!r}")
+            raise LaunchError(f"[ros2] namespace: expected a name, as robot or fleet/robot1, got {self.namespace!r}")
 
 
 @dataclass(frozen=True)
