@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogFormatter, NullLocator
 
 COLOURS = {
     "raw": "#888888",
@@ -15,7 +15,9 @@ COLOURS = {
     "One-Euro": "#4c78a8",
     "Kalman, constant velocity": "#72b7b2",
     "Kalman, constant acceleration": "#54a24b",
+    "Kalman, a density a joint": "#17becf",
     "held in the body frame": "#d8b5a5",
+    "conditional Gaussian": "#bcbd22",
     "Gaussian + Hampel": "#b279a2",
     "bank of smoothers": "#1f6f5c",
     "whole-body bank": "#0b3d91",
@@ -56,6 +58,8 @@ def curves(
         axis.set(xlabel=label, ylabel=text)
         if log:
             axis.set(xscale="log", yscale="log")
+            axis.yaxis.set_major_formatter(LogFormatter())
+            axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.5)))
             measured = sorted({r[x] for r in records if r.get(x) is not None})
             axis.set_xticks(measured, [f"{value:g}" for value in measured])
             axis.set_xticks([], minor=True)

@@ -119,7 +119,7 @@ def run(bench: Bench) -> Result:
         "hidden_bursts": figures.curves(
             [r for r in timed if r["delay"] == 4 or r["method"] in ("hold last", "One-Euro")], "seconds",
             {"hidden_mm": "error of hidden joints, mm", "seen_mm": "error of observed joints, mm"},
-            "a limb is away for, s", "Bursts, delay of at most 4 frames",
+            "a limb is hidden for, s", "Hidden limbs, delay of at most 4 frames", log=True,
         )
     }  # fmt: skip
     bins = reliability_bins(data["calibration"], "steadypose", 4)
