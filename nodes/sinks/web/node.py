@@ -35,7 +35,7 @@ from steadypose.msgs.types import (
 from steadypose.nodes.graph.node import Node
 from steadypose.nodes.settings import LaunchError, check_host_and_port
 from steadypose.nodes.sinks.serving import LOCAL_NAMES
-from steadypose.prior.body.skeleton import PARENTS
+from steadypose.prior.body.skeleton import PARENTS, VRM
 
 if TYPE_CHECKING:
     from steadypose.nodes.sinks.web.server import WebServer
@@ -127,6 +127,7 @@ def hello() -> str:
             "version": VERSION,
             "joints": JOINTS,
             "parents": PARENTS,
+            "vrm": VRM,
             "contacts": CONTACTS,
             "states": [state.name for state in JointState],
             "events": [kind.name for kind in EventKind],
@@ -172,6 +173,7 @@ def _body(body: WorldBody) -> dict[str, Any]:
         "orientation": _numbers(body.root_orientation),
         "velocity": _numbers(body.root_velocity),
         "positions": _numbers(body.positions),
+        "rotations": _numbers(body.rotations),
         "state": body.state.tolist(),
         "sigma": _numbers(body.sigma),
         "contacts": _numbers(body.contacts),

@@ -153,6 +153,7 @@ def test_messages_as_json() -> None:
     names = json.loads(hello())
     assert names["states"][JointState.IMPUTED] == "IMPUTED"
     assert names["events"][EventKind.POINTS] == "POINTS"
+    assert names["vrm"][names["joints"].index("left_elbow")] == "leftLowerArm"
     message = world(1_500_000_000)
     message.bodies[0].positions[3] = np.nan
     message.bodies[0].sigma[4] = np.inf
@@ -162,6 +163,7 @@ def test_messages_as_json() -> None:
     assert (said["topic"], said["stamp"], said["frame"]) == ("pose/world", 1.5, "world")
     assert (body["id"], body["tracking"], body["positions"][2]) == (7, "COASTING", [6.0, 7.0, 8.0])
     assert body["positions"][3] == [None] * 3
+    np.testing.assert_allclose(body["rotations"], message.bodies[0].rotations, atol=1e-4)
     assert body["sigma"][4] is None
     assert [contact is None for contact in body["contacts"]] == [k == 2 for k in range(8)]
     (event,) = json.loads(to_json(events()) or "")["events"]

@@ -10,6 +10,8 @@ export interface Names {
   joints: string[];
   /** index of each joint's parent, -1 for the pelvis */
   parents: number[];
+  /** each joint's bone in VRM 1.0 */
+  vrm: string[];
   contacts: string[];
   states: ["UNKNOWN", "SEEN", "REFINED", "IMPUTED"];
   events: EventKind[];
@@ -26,6 +28,9 @@ export interface Body {
   velocity: Vector;
   /** positions of the joints, in the order of Names.joints; null where there is no estimate */
   positions: ([number | null, number | null, number | null])[];
+  /** quaternions xyzw of the joints, each relative to its parent, the pelvis' to the world; the rest pose is a T-pose that
+   *  faces +x, left is +y, up is +z */
+  rotations: [number, number, number, number][];
   /** indices into Names.states */
   state: number[];
   /** metres, standard deviation of a position along an axis */

@@ -36,7 +36,7 @@ class Connection {
 
   constructor(options) {
     this.#options = options;
-    this.names = null; // { joints, parents, contacts, states, events }, once connected
+    this.names = null; // { joints, parents, vrm, contacts, states, events }, once connected
     this.state = "connecting"; // or "open", "closed"
     this.#open();
   }
