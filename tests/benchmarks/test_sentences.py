@@ -27,7 +27,13 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
         r"with COCO's joints, in independent noise of 2 cm, the mean error is (\S+) mm instead of (\S+) ",
         [("layouts", "layouts", f"{layout}, all observed: steadypose", "all, mm") for layout in ("coco17", "smpl22")],
     ),
-    ("README.md", r"Two cores .* \(AMD EPYC\) carry (\d+) people", [("latency", "live", "32", "bodies answered")]),
+    (
+        "README.md",
+        r"\(AMD EPYC\), `prior` takes (\S+) ms and `trajectory` (\S+) ms per frame of one person",
+        [("latency", "compute", "1", f"{node}, wall, p50") for node in ("prior", "trajectory")],
+    ),
+    ("README.md", r"comes (\S+) ms \(p99 (\S+) ms\)", [("latency", "live", "1", column) for column in ("p50", "p99")]),
+    ("README.md", r"process every frame of (\d+) people", [("latency", "live", "16", "bodies answered")]),
     (
         "docs/fit.md",
         r"in 4 cm of noise is (\S+) mm, of `clean` with 8 frames of delay ([\d.]+); of what is hidden below 0.9 m\s"
