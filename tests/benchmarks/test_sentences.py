@@ -56,11 +56,6 @@ SENTENCES: list[tuple[str, str, list[Cell]]] = [
     ),
     (
         "docs/fit.md",
-        r"the same energy has (\S+) mm instead of ([\d.]+)\.",
-        [("humor_credit", "humor_rollout", method, "all, mm") for method in ("latents rolled out", "full energy")],
-    ),
-    (
-        "docs/fit.md",
         r"It takes (\S+) s of processor time for 3 s of one body, from key points (\S+) s, with points (\S+) s\.",
         [("humor", f"humor-{table}", FIT, "s a clip") for table in ("noisy", "detector", "depth")],
     ),
