@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from steadypose.nodes.commands.doctor_checks import INSTALL, MACHINE, PROJECT, Finding, Verdict
 from steadypose.nodes.extras import EXTRAS, install_command
@@ -47,11 +48,11 @@ def doctor(live: bool = False, launch: Annotated[str, tyro.conf.arg(metavar="FIL
     with console.status("looking"):
         findings = [finding for check in CHECKS for finding in _examine(check)]
     for finding in findings:
-        table.add_row(finding.verdict.value, finding.what, finding.found)
+        table.add_row(Text(*finding.verdict.value), finding.what, finding.found)
     console.print(table)
     for finding in findings:
         if finding.fix:
-            console.print(f"\n{finding.verdict.value} {finding.what}: {finding.found}")
+            console.print(Text.assemble("\n", finding.verdict.value, f" {finding.what}: {finding.found}"))
             console.print(f"  {finding.fix}", soft_wrap=True)
     bad = [finding.what for finding in findings if finding.verdict is Verdict.BAD]
     console.print()

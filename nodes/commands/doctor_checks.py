@@ -25,12 +25,12 @@ INSTALL = install_command()
 
 
 class Verdict(Enum):
-    """The result of a check, as it is printed."""
+    """The result of a check: the word that is printed, and its style."""
 
-    GOOD = "[green]ok[/]"
-    NOTE = "[yellow]note[/]"
+    GOOD = ("ok", "green")
+    NOTE = ("note", "yellow")
     """works, but not as well as it could, or for want of something optional"""
-    BAD = "[bold red]missing[/]"
+    BAD = ("missing", "bold red")
     """`steadypose run` cannot work"""
 
 

@@ -48,6 +48,7 @@ def test_exit_status_says_whether_the_main_job_can_run(bad: bool, monkeypatch, c
     out = capsys.readouterr().out
     assert "install [this]" in out
     assert out.count("not [all] there") == 2  # in the table, and above the remedy
+    assert "\nnote extra view: not [all] there\n" in out, "no markup of styles"
     assert ("cannot work yet: broken" in out) == ("ImportError: libusb is gone" in out) == bad
 
 
