@@ -241,13 +241,12 @@ def complete(
     weights: str = "default",
     seed: int | None = None,
 ) -> Poses:
-    """Complete motion, offline: `steadypose complete` on arrays.
+    """Complete motion, offline: `steadypose complete` on arrays. Arguments that are not listed are as in `clean`.
 
     Args:
         positions: as in `clean`. Joints that are NaN are missing, and so are frames between stamps more than 1/20 s
             apart.
         confidence: as in `clean`. Joints with confidence 0 are missing.
-        fps, stamp_ns, skeleton, up: as in `clean`.
         weights: weight set of the completer: 'default', or a .safetensors file.
         seed: draw an alternative instead of the expected motion, another with each seed (0 or more): what is missing
             differs from the expected motion by about ``sigma``.
@@ -288,9 +287,9 @@ def fit(
     delay: int = 8,
 ) -> Poses:
     """Fit a motion to joints, offline: `steadypose fit` on arrays. Takes a second or more per second of one body.
+    Arguments that are not listed are as in `clean`.
 
     Args:
-        positions, fps, stamp_ns, skeleton, confidence, up: as in `clean`.
         points: (T, N, 3) metres, points on the body's surface from a depth camera, in the same frame; padded with NaN.
         weights: weight set of the transition model: 'default', or a .safetensors file.
         delay: delay of `clean`, which initialises the fit, frames at 30 Hz.
