@@ -111,13 +111,13 @@ def test_what_decodes_and_is_no_message_is_refused():
     store, name = typestore(), wire_type(TOPICS[DIAGNOSTICS])
     array = store.deserialize_cdr(PAYLOADS[DIAGNOSTICS], name)
     array.status *= 2  # type: ignore[attr-defined]
-    for topic, payload, said in (
+    for topic, payload, match in (
         (POSE_RAW, encode(message), r"RawBody.confidence: expected shape \(4,\), got shape \(3,\)"),
         (POSE_RAW, bytes(nanoseconds), "nanosec"),
         (DIAGNOSTICS, bytes(store.serialize_cdr(array, name)), "status: expected one, got 2"),
         ("pose/row", PAYLOADS[POSE_RAW], "unknown topic 'pose/row': expected one of pose/raw"),
     ):
-        with pytest.raises(DecodeError, match=said):
+        with pytest.raises(DecodeError, match=match):
             decode(topic, payload)
 
 

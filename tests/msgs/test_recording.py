@@ -37,15 +37,15 @@ FRAME_NS = 33_333_333
 @cache
 def stream(frames: int = 90) -> tuple[Recorded, ...]:
     """As a recorder hears it: the clean poses four frames behind the raw ones, diagnostics once a second."""
-    heard = []
+    sent = []
     for frame in range(frames):
         stamp = START_NS + frame * FRAME_NS
-        heard += [(POSE_RAW, stamp), (POSE_TRUTH, stamp)]
+        sent += [(POSE_RAW, stamp), (POSE_TRUTH, stamp)]
         if frame >= 4:
-            heard += [(POSE_CLEAN, stamp - 4 * FRAME_NS), (POSE_WORLD, stamp - 4 * FRAME_NS)]
+            sent += [(POSE_CLEAN, stamp - 4 * FRAME_NS), (POSE_WORLD, stamp - 4 * FRAME_NS)]
         if frame % 30 == 0:
-            heard += [(POSE_EVENTS, stamp), (DIAGNOSTICS, stamp)]
-    return tuple(Recorded(topic, stamp, dataclasses.replace(EXAMPLES[topic], stamp_ns=stamp)) for topic, stamp in heard)
+            sent += [(POSE_EVENTS, stamp), (DIAGNOSTICS, stamp)]
+    return tuple(Recorded(topic, stamp, dataclasses.replace(EXAMPLES[topic], stamp_ns=stamp)) for topic, stamp in sent)
 
 
 def record(directory: Path, messages: Iterable[tuple[str, int, Message]], **options: Any) -> Path:
@@ -187,14 +187,14 @@ def test_a_truncated_recording_gives_what_is_there(data: st.DataObject, whole: P
 
 @pytest.mark.parametrize("content", [None, b"", b"\x89MCAP0\r\n", b"not a recording", bytes(1000)])
 def test_where_there_is_no_recording_it_is_said(content: bytes | None, tmp_path: Path):
-    said = r"expected a directory with \.mcap files, .*; found none"
+    match = r"expected a directory with \.mcap files, .*; found none"
     if content is not None:
         (tmp_path / "bag.mcap").write_bytes(content)
-        said = r"is not an MCAP file|holds no message"
+        match = r"is not an MCAP file|holds no message"
     record(tmp_path / "empty" / "bag", [])
     for path, why in (
-        (tmp_path, said),
-        (tmp_path / "bag.mcap", said),
+        (tmp_path, match),
+        (tmp_path / "bag.mcap", match),
         (tmp_path / "empty" / "bag", "no message on any"),
     ):
         with pytest.raises(RecordingError, match=why):
@@ -251,14 +251,14 @@ def test_other_definitions_of_our_types_are_refused_and_topics_of_others_are_pas
     text: Any = {"definition": "string data", "name": "std_msgs/msg/String"}
     other = ros_definition().replace("float32[] confidence", "float64[] confidence")
     wrong: Any
-    for wrong, said in (
+    for wrong, match in (
         ({"definition": other}, "another definition of steadypose_msgs/msg/PoseRaw"),
         ({"definition": "float32 !"}, "cannot read the definition"),
         (text, r"expected .*PoseRaw as cdr on pose/raw, got std_msgs/msg/String as cdr"),
         ({"definition": ros_definition(), "encoding": "json"}, "got steadypose_msgs/msg/PoseRaw as json"),
         (text | {"topic": "/camera"}, "holds no message on any of"),
     ):
-        with pytest.raises(RecordingError, match=said):
+        with pytest.raises(RecordingError, match=match):
             RecordingReader(foreign(tmp_path / "camera.mcap", **wrong))
     (tmp_path / "whole.mcap").write_bytes(mcap_of(whole).read_bytes())
     assert read(tmp_path) == read(whole)

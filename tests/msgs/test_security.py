@@ -35,17 +35,17 @@ def test_a_directory_that_others_may_write_to_is_refused(tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("use", "said"),
+    ("use", "text"),
     [(make_private, "expected a directory of one's own"), (load_keys, "belongs to user .*: expected keys")],
 )
-def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch, use: Callable[[Path], object], said: str):
+def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch, use: Callable[[Path], object], text: str):
     create_keys(tmp_path)
     mine = os.getuid()
     if mine == 0:  # whose directories are trusted
         os.chown(tmp_path, 1, -1)
     else:
         monkeypatch.setattr(os, "getuid", lambda: mine + 1)
-    with pytest.raises(TransportError, match=said):
+    with pytest.raises(TransportError, match=text):
         use(tmp_path)
 
 

@@ -381,7 +381,7 @@ def test_a_flood_of_subscriptions_is_cut_off_and_forgotten(endpoint: str):
         wait_until(lambda: publisher.subscribers and len(publisher._subscriptions) == 2)
 
 
-def test_what_a_subscriber_says_of_itself_is_not_believed_blindly(endpoint: str):
+def test_what_a_subscriber_claims_of_itself_is_checked(endpoint: str):
     with (
         Publisher(endpoint, reliable={"x"}, clear_text=True) as publisher,
         Subscriber(publisher.endpoint, POSE_RAW, name="friend", clear_text=True) as friend,
@@ -533,15 +533,15 @@ def test_a_source_has_one_publisher(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_subscribers_of_one_program_agree_on_whose_a_source_is(tmp_path: Path):
     paths, agreed = [f"ipc://{tmp_path}/{n}" for n in range(2)], delivery.Principals()
     with (
-        Publisher(paths[0]) as kiosk,
+        Publisher(paths[0]) as owner,
         Publisher(paths[1]) as other,
         Subscriber(paths[0], POSE_RAW, name="test", principals=agreed) as near,
         Subscriber(paths[1], POSE_RAW, name="test", principals=agreed) as far,
     ):
-        for publisher in (kiosk, other):
+        for publisher in (owner, other):
             assert publisher.wait_for_subscribers(["test"], timeout_s=SOON_S)
             publisher.publish(POSE_RAW, raw(1))
-            assert near.receive(SOON_S if publisher is kiosk else 0) or publisher is other
+            assert near.receive(SOON_S if publisher is owner else 0) or publisher is other
         assert far.receive(NEVER_S) is None
         assert far.refused == {"second publisher": 1}
 

@@ -11,7 +11,7 @@ from steadypose.msgs.codec import DEFINITIONS
 from steadypose.msgs.types import CONTACTS, JOINTS, EventKind, Hand, JointState, Phase, Pose, RawBody, Tracking
 
 
-@pytest.mark.parametrize(("message", "field", "value", "said"), [
+@pytest.mark.parametrize(("message", "field", "value", "start"), [
     (raw().bodies[0], "positions", np.zeros((17, 3)), "confidence: expected shape (17,), got shape (32,)"),
     (raw().bodies[0], "positions", np.zeros(96), "positions: expected shape (J, 3), got shape (96,)"),
     (raw().bodies[0], "confidence", ["sure"] * 32, "confidence: expected float32 numbers"),
@@ -37,10 +37,10 @@ from steadypose.msgs.types import CONTACTS, JOINTS, EventKind, Hand, JointState,
     (diagnostics(), "values", {"rate": 30.0}, "values: expected strings"),
     (Pose.identity(), "orientation", np.eye(3), "orientation: expected shape (4,), got shape (3, 3)"),
 ])  # fmt: skip
-def test_a_wrong_field_is_named(message: Any, field: str, value: object, said: str):
+def test_a_wrong_field_is_named(message: Any, field: str, value: object, start: str):
     with pytest.raises(ValueError, match="expected") as caught:
         dataclasses.replace(message, **{field: value})
-    assert str(caught.value).startswith(f"{type(message).__name__}.{said}")
+    assert str(caught.value).startswith(f"{type(message).__name__}.{start}")
 
 
 def test_arrays_get_their_type_from_lists_and_integers():

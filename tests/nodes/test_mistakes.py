@@ -1,4 +1,4 @@
-"""Mistakes of somebody who uses the library, or the command, for the first time: each is answered with what to do."""
+"""Mistakes of somebody who uses the library or the command for the first time: each error says what to do."""
 
 import sys
 import warnings
@@ -177,18 +177,18 @@ ANSWERED = {
 
 @pytest.mark.parametrize("mistake", REFUSED)
 def test_what_cannot_be_used_is_refused_with_what_to_do(mistake: str, joints: np.ndarray) -> None:
-    make, answer = REFUSED[mistake]
-    with pytest.raises(ValueError, match=answer):
+    make, match = REFUSED[mistake]
+    with pytest.raises(ValueError, match=match):
         make(joints)
 
 
 @pytest.mark.parametrize("mistake", WARNED)
 def test_what_can_be_used_is_warned_of_once(mistake: str, joints: np.ndarray) -> None:
-    make, answer = WARNED[mistake]
-    with pytest.warns(steadypose.InputWarning, match=answer) as caught:
-        answered = make(joints)
+    make, match = WARNED[mistake]
+    with pytest.warns(steadypose.InputWarning, match=match) as caught:
+        result = make(joints)
     assert {Path(warning.filename).name for warning in caught} == {Path(__file__).name}, "the program is to blame"
-    assert sorted(str(warning.message) for warning in caught) == sorted(answered.problems)
+    assert sorted(str(warning.message) for warning in caught) == sorted(result.problems)
 
 
 @pytest.mark.parametrize("command", ANSWERED)
@@ -197,10 +197,10 @@ def test_the_command_answers_with_what_to_do(command: str, tmp_path: Path, monke
     for name, text in FILES.items():
         Path(name).write_text(text)
     assert main(command.split()) == 2
-    out, told = capsys.readouterr()
-    assert ANSWERED[command] in told
+    out, printed = capsys.readouterr()
+    assert ANSWERED[command] in printed
     assert not out
-    assert "Traceback" not in told
+    assert "Traceback" not in printed
 
 
 def test_what_is_right_is_not_warned_of(joints: np.ndarray) -> None:
@@ -250,9 +250,9 @@ def test_a_missing_extra_is_said_once(command: str, extra: str, tmp_path: Path, 
     for name in ("in.csv", "in.mp4", "in.npz", "robot.urdf", "in/in.csv"):
         Path(name).touch()
     assert main(command.split()) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"steadypose {command.split()[0]}: needs ")
-    assert f"the extra {extra!r}" in told
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"steadypose {command.split()[0]}: needs ")
+    assert f"the extra {extra!r}" in printed
 
 
 @pytest.mark.slow
@@ -260,10 +260,10 @@ def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> N
     (tmp_path / "in").mkdir()
     write_npz(tmp_path / "in" / "empty.npz", np.full((60, 1, 22, 3), np.nan))
     assert main(["clean", str(tmp_path / "in" / "empty.npz"), str(tmp_path / "out.npz")]) == 1
-    told = capsys.readouterr().err
-    assert "all_missing: " in told
-    assert "the output has no pose, because of the problems above" in told
-    assert "nobody_recognised" not in told, "that all joints are missing says more"
+    printed = capsys.readouterr().err
+    assert "all_missing: " in printed
+    assert "the output has no pose, because of the problems above" in printed
+    assert "nobody_recognised" not in printed, "that all joints are missing says more"
     for _ in ("the first time", "done already"):
         assert main(["clean", str(tmp_path / "in"), str(tmp_path / "out"), "--jobs", "1"]) == 1
         assert "0 of 1 recordings are clean; 1 without anybody in it" in capsys.readouterr().err
@@ -273,9 +273,9 @@ def test_a_recording_with_nobody_in_it_is_not_clean(tmp_path: Path, capsys) -> N
 def test_what_cannot_be_trusted_has_status_1(factor: float, order: Any, cause: str, joints, tmp_path, capsys):
     write_npz(tmp_path / "in.npz", factor * joints[..., order])
     assert main(["clean", str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]) == 1
-    told = capsys.readouterr().err
-    assert cause in told
-    assert ("the output cannot be trusted" in told) != ("the output has no pose" in told)
+    printed = capsys.readouterr().err
+    assert cause in printed
+    assert ("the output cannot be trusted" in printed) != ("the output has no pose" in printed)
     assert (tmp_path / "out.npz").exists()
 
 

@@ -56,9 +56,9 @@ def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
 def call(graph: Any, kind: Any, name: str, request: Any) -> Any:
     client = graph.create_client(kind, f"/fleet/robot/steadypose/{name}")
     assert client.wait_for_service(30)
-    answer = client.call_async(request)
-    graph.executor.spin_until_future_complete(answer, 60)
-    return answer.result()
+    future = client.call_async(request)
+    graph.executor.spin_until_future_complete(future, 60)
+    return future.result()
 
 
 def state(graph: Any) -> str:
@@ -108,9 +108,9 @@ def test_a_program_that_ends_leaves_the_node_inactive(graph: Any, start: Callabl
     process = start(command=str(PROGRAM), prior__dealy="2")
     until(lambda: state(graph) == "inactive", timeout_s=60)
     process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
-    assert "delay" in said, "what steadypose says of a setting that it does not know"
-    assert "ended, with status 2" in said
+    errors = process.communicate(timeout=60)[1]
+    assert "delay" in errors, "what steadypose says of a setting that it does not know"
+    assert "ended, with status 2" in errors
 
 
 def test_a_program_that_is_not_there_is_named(graph: Any, start: Callable[..., subprocess.Popen[str]]) -> None:
@@ -129,8 +129,8 @@ def test_parameters_become_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     command = arguments(OWN | given | {"use_sim_time": True, "qos_overrides./tf.depth": 3}, "/fleet/robot")
     assert command[:3] == ["steadypose", "run", "ros2"]
     assert command[3::2] == ["--set"] * 6
-    said = {name: tomllib.loads(f"v = {value}")["v"] for name, _, value in (it.partition("=") for it in command[4::2])}
-    assert said == given | {"ros2.namespace": "fleet/robot"}
+    sets = {name: tomllib.loads(f"v = {value}")["v"] for name, _, value in (it.partition("=") for it in command[4::2])}
+    assert sets == given | {"ros2.namespace": "fleet/robot"}
     settings = [it for it in command[4::2] if it.startswith(("ros2.", "prior."))]
     assert Launch.read("ros2", settings).settings(PriorSettings).delay == 2
     assert arguments(OWN | {"ros2.namespace": "other"}, "/robot")[4:] == ['ros2.namespace="other"']

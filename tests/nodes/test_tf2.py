@@ -31,23 +31,23 @@ from tf2_py import BufferCore, ConnectivityException, ExtrapolationException, Lo
 print("ready", flush=True)
 for line in sys.stdin:
     asked = json.loads(line)
-    buffer, answers = BufferCore(Duration(10)), []
+    buffer, results = BufferCore(Duration(10)), []
     for stamp, parent, child, place, turned, static in asked["transforms"]:
-        told = TransformStamped()
-        told.header.stamp, told.header.frame_id, told.child_frame_id = Time(*divmod(stamp, 10**9)), parent, child
-        at, q = told.transform.translation, told.transform.rotation
+        sent = TransformStamped()
+        sent.header.stamp, sent.header.frame_id, sent.child_frame_id = Time(*divmod(stamp, 10**9)), parent, child
+        at, q = sent.transform.translation, sent.transform.rotation
         (at.x, at.y, at.z), (q.x, q.y, q.z, q.w) = place, turned
-        (buffer.set_transform_static if static else buffer.set_transform)(told, "test")
+        (buffer.set_transform_static if static else buffer.set_transform)(sent, "test")
     for target, source, stamp in asked["lookups"]:
         try:
             found = buffer.lookup_transform_core(target, source, Time(*divmod(stamp, 10**9))).transform
             at, q = found.translation, found.rotation
-            answers.append([[at.x, at.y, at.z], [q.x, q.y, q.z, q.w]])
+            results.append([[at.x, at.y, at.z], [q.x, q.y, q.z, q.w]])
         except ExtrapolationException:
-            answers.append("extrapolation")
+            results.append("extrapolation")
         except (ConnectivityException, LookupException):
-            answers.append("no path")
-    print(json.dumps(answers), flush=True)
+            results.append("no path")
+    print(json.dumps(results), flush=True)
 """
 Lookup = tuple[str, str, int]
 Ask = Callable[[list[tuple[Any, bool]], list[Lookup]], list[Any]]
@@ -65,17 +65,17 @@ def tf2() -> Iterator[Ask]:
         assert it.stdout
         if not it.stdout.readline():
             pytest.skip("tf2: not installed: apt-get install python3-tf2 (Debian, Ubuntu)")
-        wants, answers = it.stdin, it.stdout
+        wants, results = it.stdin, it.stdout
 
-        def ask(told: list[tuple[Any, bool]], lookups: list[Lookup]) -> list[Any]:
+        def ask(sent: list[tuple[Any, bool]], lookups: list[Lookup]) -> list[Any]:
             transforms = [
                 (stamp_ns(one.header), one.header.frame_id, one.child_frame_id, *_values(one.transform), static)
-                for message, static in told
+                for message, static in sent
                 for one in message.transforms
             ]
             wants.write(json.dumps({"transforms": transforms, "lookups": lookups}) + "\n")
             wants.flush()
-            return json.loads(answers.readline())
+            return json.loads(results.readline())
 
         yield ask
         it.stdin.close()
@@ -104,35 +104,35 @@ def _trees(draw: st.DrawFn) -> tuple[list[tuple[Any, bool]], list[Lookup]]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(2, 8))
     named = [f"f{index}" for index in range(count)]
-    told = []
+    sent = []
     stamps = st.integers(1, 12_000_000_000)
     for index in range(1, count):
         parent = draw(st.sampled_from([*named[:index], "elsewhere"]))
         static = draw(st.booleans())
         for stamp in draw(st.lists(stamps, min_size=1, max_size=1 if static else 6)):
             place, turned = rng.normal(size=3), Rotation.random(rng=rng).as_quat()
-            told.append((tf_message([transform(stamp, parent, named[index], place, turned)]), static))
+            sent.append((tf_message([transform(stamp, parent, named[index], place, turned)]), static))
     known = sorted(
         {
             name
-            for message, _ in told
+            for message, _ in sent
             for one in message.transforms
             for name in (one.child_frame_id, one.header.frame_id)
         }
     )
-    at = st.one_of(stamps, st.sampled_from([stamp_ns(message.transforms[0].header) for message, _ in told]))
+    at = st.one_of(stamps, st.sampled_from([stamp_ns(message.transforms[0].header) for message, _ in sent]))
     lookups = draw(st.lists(st.tuples(st.sampled_from(known), st.sampled_from(known), at), min_size=1, max_size=20))
-    return told, lookups
+    return sent, lookups
 
 
 @settings(max_examples=200)
 @given(asked=_trees())
 def test_our_buffer_answers_as_tf2_does(tf2: Ask, asked: tuple[list[tuple[Any, bool]], list[Lookup]]) -> None:
-    told, lookups = asked
+    sent, lookups = asked
     # what is more than ten seconds older than the newest restarts our buffer, and is refused by tf2
     newest: dict[str, int] = {}
     kept = []
-    for message, static in told:
+    for message, static in sent:
         one = message.transforms[0]
         stamp = stamp_ns(one.header)
         if stamp >= newest.get(one.child_frame_id, 0) - 10_000_000_000:

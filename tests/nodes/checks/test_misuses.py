@@ -153,7 +153,7 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
     "z of the wrong sign": (scaled(1, 1, -1), "axis_sign", "that axis' sign"),
     "x mirrored": (scaled(-1, 1, 1), "mirrored", "negate x"),
     "x and y exchanged": (axes(1, 0, 2), "mirrored", "exchange of two axes"),
-    "a selfie picture: left is right": (SELFIE, "mirrored", "left and right"),
+    "a selfie image: left is right": (SELFIE, "mirrored", "left and right"),
     "a camera that leans": (LEANING, "not_upright", "docs/calibrate.md"),
     "millimetres": (scaled(1000), "unit", "divide by 1000"),
     "centimetres": (scaled(100), "unit", "divide by 100"),
@@ -190,8 +190,8 @@ MISUSES: dict[str, tuple[Spoil, str, str]] = {
 }
 
 
-def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str, tuple[float, Level, str]]:
-    """What is told of a stream that comes at its own rate: by cause, when first, in seconds from the first message."""
+def judge(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str, tuple[float, Level, str]]:
+    """The problems of a stream that comes at its own rate: by cause, when first, in seconds from the first message."""
     check, found, due = StreamCheck(PriorSettings(max_bodies=max_bodies)), {}, START_NS + SECOND_NS
 
     def look() -> None:
@@ -211,7 +211,7 @@ def told(frames: Frames, *, max_bodies: int = 8, live: bool = True) -> dict[str,
 @pytest.mark.parametrize("misuse", MISUSES)
 def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> None:
     spoil, cause, words = MISUSES[misuse]
-    found = told([spoil(raw, index) for index, raw in enumerate(walk())])
+    found = judge([spoil(raw, index) for index, raw in enumerate(walk())])
     assert set(found) == {cause}
     after_s, _, text = found[cause]
     assert after_s <= SOON_S
@@ -226,7 +226,7 @@ def test_it_is_named_within_three_seconds_and_nothing_else_is(misuse: str) -> No
 def test_of_unsorted_stamps_no_output_is_of_use(misuse: str, level: Level) -> None:
     reverse = stamp(lambda _, k: START_NS - k * SECOND_NS // 30)
     spoil = reverse if misuse == "rows in reverse" else MISUSES[misuse][0]
-    assert told([spoil(raw, k) for k, raw in enumerate(walk())], live=False)["stamps_out_of_order"][1] == level
+    assert judge([spoil(raw, k) for k, raw in enumerate(walk())], live=False)["stamps_out_of_order"][1] == level
 
 
 def test_where_the_confidence_is_zero_a_position_means_nothing_and_who_walks_in_has_another_id() -> None:
@@ -234,38 +234,39 @@ def test_where_the_confidence_is_zero_a_position_means_nothing_and_who_walks_in_
     # three times a second somebody comes in half a metre from where somebody leaves
     come = body(lambda it, index: moved(it, 0.3 * (index // 10 % 2), index // 10))
     for harmless in (lost, come):
-        assert not told([harmless(raw, index) for index, raw in enumerate(walk())])
+        assert not judge([harmless(raw, index) for index, raw in enumerate(walk())])
 
 
 def test_people_who_enter_an_empty_room_are_not_frozen() -> None:
     nobody, *others = walk()
     two = bodies(lambda it: [it, moved(it, 1.0, 2)])
-    assert not told([dataclasses.replace(nobody, bodies=[]), *(two(raw, index) for index, raw in enumerate(others))])
+    assert not judge([dataclasses.replace(nobody, bodies=[]), *(two(raw, index) for index, raw in enumerate(others))])
 
 
 @pytest.mark.parametrize("name", [*SKELETONS, *STREAMS])
 def test_a_good_stream_has_no_problem(name: str) -> None:
     if name in SKELETONS:
-        assert not told(walk(layout=name))
+        assert not judge(walk(layout=name))
     else:
         played = open_recording(PACKAGE / "sim_data" / name)
-        assert not told([message for _, message in played if isinstance(message, PoseRaw)], live=False)
+        assert not judge([message for _, message in played if isinstance(message, PoseRaw)], live=False)
 
 
 def test_the_origin_between_the_hips_of_a_layout_without_pelvis_is_the_root() -> None:
     hips = [SKELETONS["blazepose33"].joints.index(f"{side}_hip") for side in ("left", "right")]
     centred = joints(lambda it: it - it[hips].mean(axis=0))
-    assert set(told([centred(raw, index) for index, raw in enumerate(walk(layout="blazepose33"))])) == {"root_relative"}
+    frames = [centred(raw, index) for index, raw in enumerate(walk(layout="blazepose33"))]
+    assert set(judge(frames)) == {"root_relative"}
 
 
 @pytest.mark.parametrize(("named", "meant"), [("coco17", "h36m17"), ("h36m17", "coco17"), ("kinect22", "smpl22")])
 def test_a_layout_for_another_of_as_many_joints(named: str, meant: str) -> None:
     frames = [dataclasses.replace(raw, skeleton=named) for raw in walk(layout=meant)]
-    assert f"expected skeleton {meant!r}" in told(frames)["wrong_order"][2]
+    assert f"expected skeleton {meant!r}" in judge(frames)["wrong_order"][2]
 
 
 def causes(frames: Frames, clock: Callable[[int], int] = lambda stamp_ns: stamp_ns, **settings: Any) -> list[str]:
-    """What a live stream of three seconds is told of, by a clock that gives the time of arrival."""
+    """The causes of problems of a live stream of three seconds, by a clock that gives the time of arrival."""
     check = StreamCheck(PriorSettings(**settings))
     for raw in frames:
         check.see(raw, clock(raw.stamp_ns))
@@ -306,12 +307,12 @@ class TestNode:
         assert news.level == Level.OK
         assert not from_values(news.values)
 
-    @pytest.mark.parametrize(("off", "told"), [((), "[prior.score] and [prior.impute]"), (("score", "impute"), "")])
-    def test_overload_names_the_stages_that_are_on(self, make_launch, clock, monkeypatch, off, told: str) -> None:
+    @pytest.mark.parametrize(("off", "on"), [((), "[prior.score] and [prior.impute]"), (("score", "impute"), "")])
+    def test_overload_names_the_stages_that_are_on(self, make_launch, clock, monkeypatch, off, on: str) -> None:
         monkeypatch.setattr(PriorPipeline, "offered", 100)
         settings = {f"prior.{stage}.enabled": "false" for stage in off}
         (problem,) = PriorNode(make_launch(settings, nodes='["prior"]'), clock).problems()
-        assert problem.text.endswith(f"left out; {f'switch off {told}, or ' if told else ''}use a faster machine")
+        assert problem.text.endswith(f"left out; {f'switch off {on}, or ' if on else ''}use a faster machine")
 
     @pytest.mark.parametrize(("overrun", "cause"), [(0, "slow"), (50, "overload")])
     def test_who_is_slow(self, node: PriorNode, clock: VirtualClock, overrun: int, cause: str) -> None:

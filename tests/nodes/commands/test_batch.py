@@ -62,12 +62,12 @@ def test_processes_or_a_cluster_clean_a_folder(tmp_path: Path, ray: bool, monkey
     source, out = a_folder(tmp_path / "in"), tmp_path / "out"
     assert clean(source, out, jobs=None if ray else 2, ray=ray) == 1, "one is broken"
     assert names(out) == {"manifest.jsonl", "a.npz", "day/b.npz", "day/c/c_0.mcap", "day/c/metadata.yaml"}
-    told = {line["input"]: line for line in lines(out)}
-    assert {name: line["state"] for name, line in told.items()} == {
+    states = {line["input"]: line for line in lines(out)}
+    assert {name: line["state"] for name, line in states.items()} == {
         "a.npz": "done", "broken.npz": "failed", "day/b.npz": "done", "day/c": "done",
     }  # fmt: skip
-    assert "cannot be read as .npz" in told["broken.npz"]["error"]
-    assert (told["a.npz"]["frames"], told["a.npz"]["poses"]) == (FRAMES, FRAMES)
+    assert "cannot be read as .npz" in states["broken.npz"]["error"]
+    assert (states["a.npz"]["frames"], states["a.npz"]["poses"]) == (FRAMES, FRAMES)
     clean_recording(source / "a.npz", tmp_path / "alone.npz", DEFAULT)
     with np.load(out / "a.npz") as many, np.load(tmp_path / "alone.npz") as alone:
         for name in alone.files:

@@ -44,10 +44,10 @@ def test_board_lens_and_pose_end_in_the_launch_file(pictures: Path, tmp_path: Pa
     assert "first run steadypose calibrate lens" in capsys.readouterr().err
     assert main(["calibrate", "lens", str(launch), str(pictures / "held"), "--square", square]) == 0
     assert main(["calibrate", "pose", str(launch), str(pictures / "floor"), "--square", square]) == 0
-    told = Launch.read(launch).settings(InputSettings).calibration
-    assert told.focal == pytest.approx(LENS.focal, rel=0.01)
-    assert told.pose is not None
-    millimetres, degrees = error(told.pose, EYE)
+    saved = Launch.read(launch).settings(InputSettings).calibration
+    assert saved.focal == pytest.approx(LENS.focal, rel=0.01)
+    assert saved.pose is not None
+    millimetres, degrees = error(saved.pose, EYE)
     assert millimetres < 15.0
     assert degrees < 0.5
     text = launch.read_text()
@@ -152,8 +152,8 @@ def test_the_floor_in_depth_tells_height_and_tilt_and_the_launch_file_stays_whol
 
 def test_a_calibrated_camera_sends_its_place(make_launch: Callable[..., Launch], clock: VirtualClock) -> None:
     half = np.sqrt(0.5)
-    told = {"position": "[1.0, 2.0, 1.5]", "orientation": f"[{-half}, 0.0, 0.0, {half}]"}
-    launch = make_launch({f"input.calibration.{key}": value for key, value in told.items()})
+    saved = {"position": "[1.0, 2.0, 1.5]", "orientation": f"[{-half}, 0.0, 0.0, {half}]"}
+    launch = make_launch({f"input.calibration.{key}": value for key, value in saved.items()})
     node = PoseInputNode(launch, clock, RecordingSource(bundled("sim_data", "idle")))
     message = raw(0, walking(0))
     message.calibrated = False

@@ -58,7 +58,7 @@ def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> 
     assert off["corrected"] < 0.6 * off["plain"]
 
 
-@pytest.mark.parametrize(("change", "answer"), [
+@pytest.mark.parametrize(("change", "match"), [
     ({"stamp_ns": 10**18 + 10**12 + np.arange(FRAMES) * 33_333_333}, "got no time in common"),
     ({"positions": np.full((FRAMES, 22, 3), np.nan)}, "expected a person in two frames or more"),
     ({"positions": np.ones((FRAMES, 2, 22, 3))}, "expected one person, got 2"),
@@ -67,12 +67,12 @@ def test_the_bias_is_learned_and_helps_somebody_else(tmp_path: Path, capsys) -> 
     ({"positions": waving(FRAMES)[:, ::-1]}, "in the order of their skeleton"),
     ({"stamp_ns": 10**18 + (np.arange(FRAMES) + 12) * 33_333_333}, "the reference fits best 0.40 s earlier"),
 ])  # fmt: skip
-def test_recordings_that_do_not_go_together_are_refused(change: dict, answer: str, tmp_path: Path, capsys) -> None:
+def test_recordings_that_do_not_go_together_are_refused(change: dict, match: str, tmp_path: Path, capsys) -> None:
     sensor, reference = write(tmp_path, "ann", 1.0, 0)
     good = {"positions": waving(FRAMES), "stamp_ns": 10**18 + np.arange(FRAMES) * 33_333_333, "skeleton": "smpl22"}
     np.savez(reference, **(good | change))
     assert main(["calibrate", "sensor", str(sensor), str(reference), "--out", str(tmp_path)]) == USAGE_ERROR
-    assert answer in capsys.readouterr().err
+    assert match in capsys.readouterr().err
 
 
 def test_a_reference_that_is_missing_or_has_none_of_the_sensors_joints_is_refused(tmp_path: Path, capsys) -> None:

@@ -47,7 +47,7 @@ def test_npz_to_npz(tmp_path: Path) -> None:
     }  # fmt: skip
     assert {len(array) for array in out.values()} == {FRAMES, len(out["joint_names"])} == {FRAMES, 22}
     for name in ("positions", "rotations", "sigma", "contacts", "root_velocity", "world_positions"):
-        assert np.isfinite(out[name]).all(), f"{name}: both ends are answered too"
+        assert np.isfinite(out[name]).all(), f"{name}: both ends have poses too"
     assert (out["state"] != JointState.UNKNOWN).all()
     np.testing.assert_array_equal(out["stamp_ns"], np.round(np.arange(FRAMES) * 1e9 / 30))
     np.testing.assert_allclose(np.linalg.norm(out["rotations"], axis=-1), 1.0, atol=1e-5)
@@ -145,7 +145,7 @@ def test_what_cannot_be_done_is_said(tmp_path: Path, monkeypatch, arguments: dic
     assert not Path("out.npz").exists()
 
 
-def answers(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tuple[PoseClean, PoseWorld]:
+def outputs(stamp_ns: int, position: float, turn: Rotation, body: int = 0) -> tuple[PoseClean, PoseWorld]:
     positions = np.full((22, 3), position)
     rotations = np.tile(turn.as_quat(), (22, 1))
     state = np.full(22, JointState.SEEN if position < 0.5 else JointState.IMPUTED)
@@ -167,7 +167,7 @@ def collect(*stamped: tuple[PoseClean, PoseWorld]) -> NpzCollector:
 def test_between_two_grid_times_it_interpolates_and_beyond_them_the_body_moves_on(share: float, seed: int) -> None:
     turns = Rotation.random(2, rng=np.random.default_rng(seed))
     period = round(FRAME_NS)
-    collector = collect(answers(START_NS, 0.0, turns[0]), answers(START_NS + period, 1.0, turns[1]))
+    collector = collect(outputs(START_NS, 0.0, turns[0]), outputs(START_NS + period, 1.0, turns[1]))
     stamp = START_NS + round(share * period)
     out = collector.arrays(np.array([stamp]))
     exact = (stamp - START_NS) / period
@@ -184,7 +184,7 @@ def test_between_two_grid_times_it_interpolates_and_beyond_them_the_body_moves_o
 def test_a_gap_is_not_filled_and_a_body_that_comes_later_is_unknown_before() -> None:
     still, second = Rotation.identity(), 10**9
     end = START_NS + second
-    collector = collect(answers(START_NS, 0.0, still), answers(end, 1.0, still), answers(end, 0.75, still, 7))
+    collector = collect(outputs(START_NS, 0.0, still), outputs(end, 1.0, still), outputs(end, 0.75, still, 7))
     out = collector.arrays(START_NS + np.array([-second, -20_000_000, 20_000_000, second // 2, second]))
     assert out["body_id"].tolist() == [0, 7]
     np.testing.assert_array_equal(out["positions"][:, 0, 0, 0], [np.nan, 0.0, 0.0, np.nan, 1.0])
@@ -271,15 +271,15 @@ def test_arrays_without_what_was_observed_show_no_corrections(cleaned: Path) -> 
 
 def test_info_says_what_is_in_it_and_tells_of_problems_anywhere_in_a_file(cleaned: Path, tmp_path: Path, capsys):
     assert main(["info", str(cleaned / "walk.npz")]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     arrays = f"world_positions ({WRITTEN}, 22, 3) float32"
-    for said in ("an output of clean, complete or fit", arrays, "skeleton smpl22", "imputed"):
-        assert said in told
+    for text in ("an output of clean, complete or fit", arrays, "skeleton smpl22", "imputed"):
+        assert text in printed
     assert main(["info", str(cleaned / "walk.csv")]) == 0
     of_table = capsys.readouterr().out
     assert f"{WRITTEN} frames" in of_table
-    assert re.search(r"\d+% of their joints observed", of_table)[0] in told  # type: ignore[index]
-    assert "100% of" not in told
+    assert re.search(r"\d+% of their joints observed", of_table)[0] in printed  # type: ignore[index]
+    assert "100% of" not in printed
     millimetres = np.full((240, 22, 3), np.nan)
     millimetres[:60] = 1000 * walked(60)
     assert main(["info", str(write_npz(tmp_path / "in.npz", millimetres))]) == 0

@@ -43,9 +43,9 @@ def test_help_explains_upgrading_uninstalling_and_each_command(capsys, monkeypat
     manual = (Path(__file__).parents[3] / "docs" / "library.md").read_text()
     for topic in ("upgrade", "uninstall"):
         assert main(["help", topic]) == 0
-        told = capsys.readouterr().out
+        printed = capsys.readouterr().out
         for command in ("pip install --upgrade", "pip uninstall steadypose"):
-            assert command in told
+            assert command in printed
             assert command in manual
     with pytest.raises(SystemExit):
         main(["help", "keys"])
@@ -130,10 +130,10 @@ for missing, (_, arguments) in {lacking}.items():
         assert main(arguments) == USAGE_ERROR
     del sys.modules[missing]
 """
-    told = python(code).split("\n")
+    printed = python(code).split("\n")
     for missing, (extra, _) in lacking.items():
-        assert any(f"needs {missing}" in line and install_command(extra) in line for line in told), told
-    assert not any("Traceback" in line for line in told)
+        assert any(f"needs {missing}" in line and install_command(extra) in line for line in printed), printed
+    assert not any("Traceback" in line for line in printed)
 
 
 @pytest.mark.parametrize(

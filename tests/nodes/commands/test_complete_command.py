@@ -119,7 +119,7 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
     assert 1e-4 < np.abs(searched - found)[10:20].max() < 0.2
 
 
-@pytest.mark.parametrize(("out", "more", "said"), [
+@pytest.mark.parametrize(("out", "more", "match"), [
     ("in.npz", {}, "nothing is written in place"),
     ("no/out.npz", {}, "make it first"),
     ("out.npz", {"picture": Path("a.txt")}, r"ending in \.png"),
@@ -127,16 +127,16 @@ def test_hm_vae_may_be_searched_and_meets_what_is_known(tmp_path: Path, monkeypa
     ("out.npz", {"source": Path("none.npz")}, "expected a body with joints"),
     ("mine.npz", {}, "--force"),
 ])  # fmt: skip
-def test_what_cannot_be_is_said(out: str, more: dict[str, Any], said: str, tmp_path: Path, monkeypatch) -> None:
+def test_what_cannot_be_is_said(out: str, more: dict[str, Any], match: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_npz(Path("in.npz"), waving(20))
     write_npz(Path("mm.npz"), waving(20) * 1000)
     write_npz(Path("none.npz"), np.full((5, 22, 3), np.nan))
     Path("mine.npz").write_text("mine")
     asked: dict[str, Any] = {"source": Path("in.npz"), "out": Path(out)} | more
-    with pytest.raises((ValueError, FileNotFoundError), match=said):
+    with pytest.raises((ValueError, FileNotFoundError), match=match):
         complete(**asked)
     assert Path("mine.npz").read_text() == "mine"
-    if said == "--force":
+    if match == "--force":
         complete(**asked, force=True)
         assert np.load("mine.npz")["positions"].shape == (20, 22, 3)

@@ -73,7 +73,7 @@ def test_a_missing_package_and_a_missing_extra(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(monkeypatch, tmp_path: Path) -> None:
-    assert set(command.required()[1]) == set(command.EXTRAS), "every extra is told what for"
+    assert set(command.required()[1]) == set(command.EXTRAS), "every extra has its purpose"
     pulled = command.PROJECT.read_text().replace("dependencies = [", 'dependencies = [\n  "brandnew>=1",', 1)
     monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
     command.PROJECT.write_text(pulled)
@@ -82,13 +82,13 @@ def test_what_a_pull_brought_is_missed_though_nothing_was_installed_anew(monkeyp
 
 
 def test_an_installed_wheel_is_asked_what_it_requires(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    told = ["numpy>=1.26", "tomli>=2; python_version < '3.0'", "rerun-sdk>=0.30; extra == 'view'"]
-    told.append("ros-rclpy>=9.1; sys_platform == 'nowhere' and extra == 'ros2'")
+    given = ["numpy>=1.26", "tomli>=2; python_version < '3.0'", "rerun-sdk>=0.30; extra == 'view'"]
+    given.append("ros-rclpy>=9.1; sys_platform == 'nowhere' and extra == 'ros2'")
     monkeypatch.setattr(command, "PROJECT", tmp_path / "pyproject.toml")
-    monkeypatch.setattr(command, "requires", lambda name: told)
+    monkeypatch.setattr(command, "requires", lambda name: given)
     needed, extras = command.required()
-    assert needed == told[:2]
-    assert extras == {"view": told[2:3], "ros2": told[3:]}
+    assert needed == given[:2]
+    assert extras == {"view": given[2:3], "ros2": given[3:]}
     assert verdicts(command.check_packages)["packages"] is Verdict.GOOD
     assert "extra ros2" not in verdicts(command.check_packages)
 
@@ -230,14 +230,14 @@ def heard(file: str, frames: list[PoseRaw]) -> tuple[int, str]:
         return command.listen(file, console), console.export_text()
 
 
-@pytest.mark.parametrize(("frames", "status", "told"), [
+@pytest.mark.parametrize(("frames", "status", "problem"), [
     ([dataclasses.replace(raw, calibrated=False) for raw in walk(120)], 0, "no problems found"),
     ([dataclasses.replace(raw, skeleton="smpl") for raw in walk(30)], 1, "most like 'smpl22'"),
     ([], 1, "start the tracker"),
 ], ids=["good", "bad", "none"])  # fmt: skip
-def test_what_is_wrong_with_a_tracker_is_told(file: str, frames: list[PoseRaw], status: int, told: str) -> None:
+def test_what_is_wrong_with_a_tracker_is_told(file: str, frames: list[PoseRaw], status: int, problem: str) -> None:
     found, text = heard(file, frames)
-    assert (found, told in text) == (status, True), text
+    assert (found, problem in text) == (status, True), text
 
 
 def test_each_client_of_a_server_is_examined_by_itself(file: str, folder: Path) -> None:
@@ -256,9 +256,9 @@ def test_all_clients_of_a_server_are_examined(file: str, folder: Path) -> None:
     clients = [f"ipc://{folder}/pose_input", *(f"tcp://127.0.0.1:{port}" for port in range(1, 6))]
     Path(file).write_text(f'nodes = ["prior"]\n[server]\nclients = {clients}\n{Path(file).read_text()}')
     frames = [
-        dataclasses.replace(raw, source=f"kiosk {k}", skeleton="octopus")
+        dataclasses.replace(raw, source=f"client {k}", skeleton="octopus")
         for raw in walk(30)
         for k in range(len(clients))
     ]
     _, text = heard(file, frames)
-    assert [f"kiosk {k}.unknown_skeleton" in text for k in range(len(clients))] == [True] * len(clients), text
+    assert [f"client {k}.unknown_skeleton" in text for k in range(len(clients))] == [True] * len(clients), text

@@ -105,11 +105,11 @@ def test_glb_moves_its_joints_and_its_skin_where_the_body_is(tmp_path: Path, mot
     file: Any = GLTF2().load(str(path))
 
     def values(accessor: int) -> NDArray[np.generic]:
-        told = file.accessors[accessor]
-        kind = {5126: np.float32, 5123: np.uint16, 5121: np.uint8}[told.componentType]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[told.type]
-        start = file.bufferViews[told.bufferView].byteOffset or 0
-        return np.frombuffer(file.binary_blob(), kind, told.count * width, start).reshape(-1, width)
+        entry = file.accessors[accessor]
+        kind = {5126: np.float32, 5123: np.uint16, 5121: np.uint8}[entry.componentType]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[entry.type]
+        start = file.bufferViews[entry.bufferView].byteOffset or 0
+        return np.frombuffer(file.binary_blob(), kind, entry.count * width, start).reshape(-1, width)
 
     expected = motion.positions @ TO_Z_UP["y"]
     frame = 17
@@ -197,20 +197,20 @@ def test_a_rounded_frame_time_costs_no_frame(motion: BodyMotion) -> None:
     assert (found.fps, len(found.root)) == (120.0, len(whole))
 
 
-@pytest.mark.parametrize(("source", "out", "more", "said"), [
+@pytest.mark.parametrize(("source", "out", "more", "match"), [
     ("clean.npz", "there.glb", [], "--force"),
     ("clean.npz", "take.fbx", [], ".bvh, .glb, .vrma, .csv, .trc"),
     ("raw.npz", "take.bvh", [], "clean it first"),
     ("clean.npz", "take.csv", ["--names", "vrm"], "expected OUT to end in .bvh or .glb, got .csv"),
     ("back.npz", "take.bvh", [], "stamps, got 1.266666667 s after 1.300000000 s; sort the input by stamp"),
 ])  # fmt: skip
-def test_what_cannot_be_written_is_said(source: str, out: str, more: list[str], said: str, tmp_path, motion, capsys):
+def test_what_cannot_be_written_is_said(source: str, out: str, more: list[str], match: str, tmp_path, motion, capsys):
     npz(tmp_path / "clean.npz", motion)
     npz(tmp_path / "back.npz", motion, backwards=True)
     np.savez(tmp_path / "raw.npz", positions=np.zeros((3, 22, 3)), fps=30.0)
     (tmp_path / "there.glb").touch()
     assert main(["export", str(tmp_path / source), str(tmp_path / out), *more]) == 2
-    assert said in capsys.readouterr().err
+    assert match in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["back.npz", "clean.npz", "raw.npz", "there.glb"]
 
 

@@ -48,8 +48,8 @@ def key_points(**more: object) -> dict:
     optical = in_camera()
     pixels = optical[..., :2] / optical[..., 2:] * 900.0 + [640.0, 360.0]
     pixels[3, 4] = np.nan
-    told = {"keypoints": pixels, "skeleton": "smpl22", "fps": 30.0, "focal": 900.0, "centre": [640.0, 360.0]}
-    return told | {"camera_height": 1.3} | more
+    given = {"keypoints": pixels, "skeleton": "smpl22", "fps": 30.0, "focal": 900.0, "centre": [640.0, 360.0]}
+    return given | {"camera_height": 1.3} | more
 
 
 def test_arrays_in_and_out(seen: Path, tmp_path: Path, capsys) -> None:
@@ -83,11 +83,11 @@ def test_a_recording_has_all_topics(seen: Path, tmp_path: Path) -> None:
 
 def test_key_points_become_a_motion_in_the_cameras_frame(pictured: Path, tmp_path: Path) -> None:
     assert main(["fit", str(pictured), str(tmp_path / "out.npz")]) == 0
-    with np.load(tmp_path / "out.npz") as out, np.load(pictured) as told:
+    with np.load(tmp_path / "out.npz") as out, np.load(pictured) as given:
         assert out["positions"].shape == (FRAMES, 22, 3)
         assert out["positions"][:, 0, 2].mean() == pytest.approx(4.0, abs=1.0)
         projected = out["positions"][..., :2] / out["positions"][..., 2:] * 900.0 + [640.0, 360.0]
-        assert np.nanmedian(np.linalg.norm(projected - told["keypoints"], axis=-1)) < 40.0
+        assert np.nanmedian(np.linalg.norm(projected - given["keypoints"], axis=-1)) < 40.0
         normal = out["ground_plane"][:3]
         assert normal[2] > 0.95
         way = np.gradient(out["world_positions"][:, 0], 1 / 30, axis=0)
@@ -111,10 +111,10 @@ def test_with_the_users_model_there_is_a_motion_of_it(seen: Path, tmp_path: Path
     assert "mean distance of SMPL's joints" in capsys.readouterr().err
     fps, read = read_motion("smpl.npz", (tmp_path / "out.npz.smpl.0.npz").read_bytes())
     with np.load(tmp_path / "out.npz") as out:
-        said = out["world_positions"]
+        positions = out["world_positions"]
     assert fps == 30.0
     assert len(read) >= FRAMES - 1
-    moved = said[-1, 0] - said[0, 0]
+    moved = positions[-1, 0] - positions[0, 0]
     np.testing.assert_allclose(read[-1, 0] - read[0, 0], moved, atol=0.05)
     (tmp_path / "model.npz").write_bytes(b"no model")
     assert main(["fit", str(seen), str(tmp_path / "new.npz"), "--smpl", str(tmp_path / "model.npz")]) == 2
@@ -168,7 +168,7 @@ def upside_down(share: float = 1.0) -> np.ndarray:
     return keys
 
 
-@pytest.mark.parametrize(("told", "warned"), [
+@pytest.mark.parametrize(("given", "warned"), [
     (key_points(), False),
     (key_points(up="y"), True),
     (key_points(up="z"), False),  # a camera that looks straight up or down
@@ -176,8 +176,8 @@ def upside_down(share: float = 1.0) -> np.ndarray:
     (key_points(keypoints=upside_down(), up="y"), False),
     (key_points(keypoints=upside_down(0.9)), False),  # who stands on their hands for a while
 ])  # fmt: skip
-def test_a_picture_upside_down_is_warned_of(told: dict, warned: bool, tmp_path: Path) -> None:
-    np.savez(tmp_path / "keys.npz", **told)
+def test_an_image_upside_down_is_warned_of(given: dict, warned: bool, tmp_path: Path) -> None:
+    np.savez(tmp_path / "keys.npz", **given)
     problems = check_up(read_key_points(tmp_path / "keys.npz"))
     assert [text.split(":")[0] for text in problems] == ["up_axis"] * warned
 
@@ -185,19 +185,19 @@ def test_a_picture_upside_down_is_warned_of(told: dict, warned: bool, tmp_path: 
 def test_wrong_axes_are_said(seen: Path, pictured: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("steadypose.nodes.commands.fit.check_up", lambda recording: ["up_axis: in the image"])
     write_npz(tmp_path / "lying.npz", POSITIONS[..., [1, 2, 0]])
-    for source, said in (("lying.npz", "up_axis: bodies lie"), ("keys.npz", "up_axis: in the image")):
+    for source, warning in (("lying.npz", "up_axis: bodies lie"), ("keys.npz", "up_axis: in the image")):
         assert main(["fit", str(tmp_path / source), str(tmp_path / f"out-{source}")]) == 0
-        assert said in capsys.readouterr().err
+        assert warning in capsys.readouterr().err
     with pytest.warns(steadypose.InputWarning, match="up_axis"):
         assert "up_axis" in steadypose.fit(POSITIONS[..., [1, 2, 0]], fps=30).problems[0]
 
 
 def test_key_points_are_put_on_the_grid(tmp_path: Path) -> None:
     path = tmp_path / "slow.npz"
-    told = key_points(fps=15.0)
-    np.savez(path, **told)
+    given = key_points(fps=15.0)
+    np.savez(path, **given)
     found = read_key_points(path)
     assert len(found.stamps_ns) == 2 * FRAMES - 1
-    np.testing.assert_allclose(found.pixels[::2][5], told["keypoints"][5], atol=0.1)
-    np.testing.assert_allclose(found.pixels[1], (told["keypoints"][0] + told["keypoints"][1]) / 2, atol=0.1)
+    np.testing.assert_allclose(found.pixels[::2][5], given["keypoints"][5], atol=0.1)
+    np.testing.assert_allclose(found.pixels[1], (given["keypoints"][0] + given["keypoints"][1]) / 2, atol=0.1)
     assert found.confidence[6, 4] == 0.0

@@ -92,11 +92,11 @@ def test_the_end_of_a_stream_is_no_frame_of_it(tmp_path: Path, capsys: pytest.Ca
         record(tmp_path / name, [*frames, end_of(frames[-1])])
         assert info(str(tmp_path / name)) == 0
         hz(str(tmp_path / name))
-    said = capsys.readouterr().out
-    assert "2 messages\n" in said
-    assert "pose/raw: no rate, window: 1\n" in said
-    assert "3 messages, 30.00 Hz, longest gap 33 ms\n" in said
-    assert "pose/raw: average rate: 30.000 Hz" in said
+    printed = capsys.readouterr().out
+    assert "2 messages\n" in printed
+    assert "pose/raw: no rate, window: 1\n" in printed
+    assert "3 messages, 30.00 Hz, longest gap 33 ms\n" in printed
+    assert "pose/raw: average rate: 30.000 Hz" in printed
 
 
 def test_rates_of_uneven_times_are_told_once_a_second_and_look_back_no_further_than_the_window() -> None:

@@ -28,13 +28,13 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What would be done to this machine, in place of doing it; units go to a folder of the test's own."""
-    said: list[str] = []
+    called: list[str] = []
     monkeypatch.setattr(command, "UNITS", tmp_path)
     monkeypatch.setattr(command, "BOOTED", tmp_path)
     monkeypatch.setattr(command, "compile_missing", lambda say: None)
     monkeypatch.setattr(command.os, "geteuid", lambda: 0)
-    monkeypatch.setattr(command.subprocess, "run", lambda words, check: said.append(" ".join(words)))
-    return said
+    monkeypatch.setattr(command.subprocess, "run", lambda words, check: called.append(" ".join(words)))
+    return called
 
 
 def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
         assert "poses.service" not in checked.stderr, checked.stderr
 
 
-@pytest.mark.parametrize(("changed", "settings", "said"), [
+@pytest.mark.parametrize(("changed", "settings", "match"), [
     ({"command": Path("/home/a/bin/steadypose")}, {}, "in a home.*/usr/bin/python3 -m venv /opt.*pip install PATH"),
     ({"launch": "/home/a/my.toml"}, {}, "in a home.*copy the launch file"),
     ({"launch": "/tmp/a/my.toml", "is_new_user": False}, {}, "in a folder of temporary files"),
@@ -66,9 +66,9 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     ({}, {"nodes": '["recorder"]', "recorder.directory": "/data/out"}, r"\[recorder\] directory: .*/var/lib/poses"),
     ({}, {"transport.directory": "/srv/sockets"}, r"\[transport\] directory: .*/run/poses"),
 ])  # fmt: skip
-def test_what_a_service_could_not_do_is_said(changed: dict[str, object], settings: dict[str, str], said: str) -> None:
+def test_what_a_service_could_not_do_is_said(changed: dict[str, object], settings: dict[str, str], match: str) -> None:
     launch = Launch.read("replay", [f"{key}={value}" for key, value in settings.items()])
-    with pytest.raises(LaunchError, match=said):
+    with pytest.raises(LaunchError, match=match):
         service(**changed).check(launch)
 
 
@@ -80,9 +80,9 @@ def test_a_user_may_run_what_lies_in_his_home() -> None:
 
 def test_a_dry_run_does_nothing_and_what_is_installed_is_removed(done: list[str], tmp_path: Path, capsys) -> None:
     assert install_service("replay", name="poses-test", user="root", dry_run=True) == 0
-    said = capsys.readouterr().out
-    assert "[Service]" in said
-    assert "+ systemctl enable poses-test.service" in said
+    printed = capsys.readouterr().out
+    assert "[Service]" in printed
+    assert "+ systemctl enable poses-test.service" in printed
     assert not [*done, *tmp_path.iterdir()]
     assert install_service("replay", name="poses-test", user="root") == 0
     unit = tmp_path / "poses-test.service"
@@ -99,11 +99,11 @@ def test_a_dry_run_does_nothing_and_what_is_installed_is_removed(done: list[str]
 
 def test_a_unit_of_somebody_elses_is_left_alone(done: list[str], tmp_path: Path) -> None:
     (tmp_path / "nginx.service").write_text("[Service]\n")
-    for name, uninstall, said in (
+    for name, uninstall, match in (
         ("nginx", False, "not made by this command"),
         ("nginx", True, "not made by this command"),
         ("none", True, "nothing to remove"),
     ):
-        with pytest.raises(LaunchError, match=said):
+        with pytest.raises(LaunchError, match=match):
             install_service("replay", name=name, user="root", uninstall=uninstall)
     assert not done

@@ -43,9 +43,9 @@ def recorded(
 
 
 def drawn(recording: Path) -> bool:
-    picture = recording.with_suffix(".png")
-    plot(recording, picture)
-    return picture.read_bytes().startswith(b"\x89PNG")
+    image = recording.with_suffix(".png")
+    plot(recording, image)
+    return image.read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_arms_of_a_layout_without_collars_hang_at_the_neck() -> None:
@@ -136,10 +136,10 @@ def test_shows_the_joints_that_were_most_often_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("bodies", "output", "options", "expected"), [
-    (1, "picture.gif", {}, "ending in .png, .svg or .pdf"),
-    (1, "nowhere/picture.png", {}, "no directory; make it first"),
-    (1, "picture.png", {"body": 9}, r"expected one of \[0\], got 9"),
-    (0, "picture.png", {}, "expected at least one body, got none; see `steadypose info`"),
+    (1, "image.gif", {}, "ending in .png, .svg or .pdf"),
+    (1, "nowhere/image.png", {}, "no directory; make it first"),
+    (1, "image.png", {"body": 9}, r"expected one of \[0\], got 9"),
+    (0, "image.png", {}, "expected at least one body, got none; see `steadypose info`"),
 ])  # fmt: skip
 def test_what_cannot_be_drawn_says_why(tmp_path: Path, bodies: int, output: str, options: dict, expected: str) -> None:
     recording = recorded(tmp_path / "bag", 0.2, {POSE_RAW}, bodies=bodies)
@@ -152,13 +152,13 @@ def test_a_full_disk_is_said_and_the_picture_that_was_there_stays(tmp_path: Path
         path.write_bytes(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    recording, picture = recorded(tmp_path / "bag", 0.2, {POSE_RAW}), tmp_path / "picture.png"
-    picture.write_bytes(b"whole")
+    recording, image = recorded(tmp_path / "bag", 0.2, {POSE_RAW}), tmp_path / "image.png"
+    image.write_bytes(b"whole")
     monkeypatch.setattr(Figure, "savefig", save_half)
-    with pytest.raises(LaunchError, match=r"picture.png: No space left on device; make room"):
-        plot(recording, picture)
-    assert picture.read_bytes() == b"whole"
-    assert {path.name for path in tmp_path.iterdir()} == {"bag", "picture.png"}
+    with pytest.raises(LaunchError, match=r"image.png: No space left on device; make room"):
+        plot(recording, image)
+    assert image.read_bytes() == b"whole"
+    assert {path.name for path in tmp_path.iterdir()} == {"bag", "image.png"}
 
 
 def labels(figure: Figure, title: str) -> list[str]:

@@ -23,16 +23,16 @@ Start = Callable[[str], Child]
 
 
 @pytest.fixture
-def said() -> list[str]:
+def log() -> list[str]:
     return []
 
 
 @pytest.fixture
-def start(clock: VirtualClock, said: list[str]) -> Iterator[Start]:
+def start(clock: VirtualClock, log: list[str]) -> Iterator[Start]:
     with ExitStack() as children:
 
         def start(code: str) -> Child:
-            child = Child("prior", [sys.executable, "-c", code], clock, said.append)
+            child = Child("prior", [sys.executable, "-c", code], clock, log.append)
             children.callback(child.stop)
             return child
 
@@ -56,7 +56,7 @@ def test_a_node_that_has_nothing_more_to_do_is_not_started_again(start: Start, s
     assert (child.state, child.restarts) == (state, 0)
 
 
-def test_a_node_that_crashes_starts_again_a_little_later_each_time(start: Start, clock: VirtualClock, said: list[str]):
+def test_a_node_that_crashes_starts_again_a_little_later_each_time(start: Start, clock: VirtualClock, log: list[str]):
     child = start("raise SystemExit(7)")
     child.heard()
     for restarts, pause_s in enumerate([*BACKOFF_S, BACKOFF_S[-1], BACKOFF_S[-1]]):
@@ -69,7 +69,7 @@ def test_a_node_that_crashes_starts_again_a_little_later_each_time(start: Start,
         assert (child.state, child.restarts) == ("running", restarts + 1)
     ended(child)
     assert child.state == "crashed", "there is no last time"
-    assert said[:2] == [f"prior: ended with status 7; starting it again in {pause} s" for pause in ("0", "0.5")]
+    assert log[:2] == [f"prior: ended with status 7; starting it again in {pause} s" for pause in ("0", "0.5")]
 
 
 def test_a_node_never_heard_has_failed_at_last_and_one_that_ran_gets_new_chances(start: Start, clock: VirtualClock):
@@ -87,7 +87,7 @@ def test_a_node_never_heard_has_failed_at_last_and_one_that_ran_gets_new_chances
         assert heard.state == "running", "again, and at once"
 
 
-def test_a_node_that_falls_silent_is_killed_and_started_again(start: Start, clock: VirtualClock, said: list[str]):
+def test_a_node_that_falls_silent_is_killed_and_started_again(start: Start, clock: VirtualClock, log: list[str]):
     child = start(FOREVER)
     later(child, clock, 2 * HUNG_S)
     assert child.state == "running", "the first start may take long"
@@ -97,13 +97,13 @@ def test_a_node_that_falls_silent_is_killed_and_started_again(start: Start, cloc
     child.heard()
     assert child.state == "running"
     later(child, clock, HUNG_S + 0.1)
-    assert "killing it" in said[0]
+    assert "killing it" in log[0]
     assert (child.state, child.restarts, child.silent_s) == ("running", 1, 0.0)
 
 
-def test_a_supervisor_that_was_away_blames_nobody(clock: VirtualClock, said: list[str], monkeypatch) -> None:
+def test_a_supervisor_that_was_away_blames_nobody(clock: VirtualClock, log: list[str], monkeypatch) -> None:
     monkeypatch.setattr(supervisor, "COMMAND", (sys.executable, "-c", FOREVER))
-    with Supervisor(["prior"], [], clock, said.append) as processes:
+    with Supervisor(["prior"], [], clock, log.append) as processes:
         child = processes.children["prior"]
         child.heard()
         clock.time_ns += round(HUNG_S * 2e9)
@@ -173,12 +173,12 @@ def test_what_another_runs_nodes_say_is_not_believed(clock: VirtualClock, make_l
     run = _Run(make_launch(nodes='["prior"]'), [], Console(quiet=True), clock, "this", True)
     processes: Any = Processes("prior")
     for identity in ("another", ""):
-        topic, said = news("prior")
-        said.values[RUN] = identity
-        run._receive((topic, said), processes)
+        topic, message = news("prior")
+        message.values[RUN] = identity
+        run._receive((topic, message), processes)
     assert not run._diagnostics
-    said.values[RUN] = "this"
-    run._receive((topic, said), processes)
+    message.values[RUN] = "this"
+    run._receive((topic, message), processes)
     assert run._diagnostics["prior"].values[RUN] == "this"
 
 
@@ -190,14 +190,14 @@ def shown(diagnostics: dict[str, Diagnostics], width: int) -> str:
 
 
 def test_the_table_and_the_line_show_what_there_is_to_see() -> None:
-    told = [
+    messages = [
         news("pose_input", rate__pose__raw="30.04", count__pose__raw="300"),
         news(
             "prior", level=Level.WARN, bodies="2", anomalies="1", delay_frames="4", refused__unknown_skeleton="5",
             latency_ms__p50="3.14", latency_ms__p99="9.87", rate__pose__clean="29.98",
         ),
     ]  # fmt: skip
-    latest = {message.node: message for _, message in told}
+    latest = {message.node: message for _, message in messages}
     for text in ("30.0", "3.1/9.9", "133", "unknown_skeleton 5", "flagged", "starting"):
         assert text in shown(latest, 140)
     assert "restarts" not in shown(latest, 140), "nothing to say there"

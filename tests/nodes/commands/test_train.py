@@ -84,13 +84,13 @@ def test_little_and_next_to_nothing_are_refused_before_training(shipped: Path, t
     for enough in (prepared(tmp_path / "a.npz", 31.0), tmp_path / "other.npz", tmp_path):
         assert command.little_data(enough, "default") == ""
     path = prepared(tmp_path / "b.npz", 0.2, 12.0)
-    said = command.little_data(path, "research")
-    assert "has 12.2 minutes of motion to train the 'research' weights on, which is little" in said
-    assert "or fine-tune with --start default" in said
+    printed = command.little_data(path, "research")
+    assert "has 12.2 minutes of motion to train the 'research' weights on, which is little" in printed
+    assert "or fine-tune with --start default" in printed
     assert command.little_data(path, "research", "default").endswith("expected 30; prepare more recordings")
     monkeypatch.setattr("steadypose.training.recipes.hmvae.train_hmvae", lambda options: pytest.fail("it was trained"))
     assert main(["train", "hmvae", "--data", str(path), "--runs", str(tmp_path / "runs")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "has 0.2 minutes of motion to train the 'default' weights on: expected at least 0.5" in said
-    assert said.endswith("; prepare more recordings")
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "has 0.2 minutes of motion to train the 'default' weights on: expected at least 0.5" in printed
+    assert printed.endswith("; prepare more recordings")
     assert not (tmp_path / "runs").exists()

@@ -31,10 +31,10 @@ Spoil = Callable[[PoseRaw], PoseRaw]
 
 @pytest.fixture(scope="module")
 def reference() -> dict[int, PoseWorld]:
-    return worlds(answers(BASE)[0])
+    return worlds(outputs(BASE)[0])
 
 
-def answers(frames: list[PoseRaw]) -> tuple[list[Message], Counter[str]]:
+def outputs(frames: list[PoseRaw]) -> tuple[list[Message], Counter[str]]:
     prior, trajectory = make_prior({}), make_trajectory({})
     messages = [message for _, message in stream([(POSE_RAW, frame) for frame in frames], prior, trajectory)]
     return messages, prior.counters + trajectory.counters
@@ -126,7 +126,7 @@ STREAMS: dict[str, tuple[list[PoseRaw], dict[str, int]]] = {
 @pytest.mark.parametrize("kind", STREAMS)
 def test_a_good_frame_after_bad_ones_is_answered(kind: str) -> None:
     frames, counted = STREAMS[kind]
-    messages, counts = answers(frames)
+    messages, counts = outputs(frames)
     assert counts == counted
     check_promises(messages, restarts=kind.startswith("an hour back"))
     for of in (PoseClean, PoseWorld):
@@ -153,7 +153,7 @@ ONE_BAD_FRAME: dict[str, Spoil] = {
 @pytest.mark.parametrize("kind", ONE_BAD_FRAME)
 def test_one_bad_frame_is_over_within_a_second(kind: str, reference: dict[int, PoseWorld]) -> None:
     frames = [ONE_BAD_FRAME[kind](frame) if k == BAD else frame for k, frame in enumerate(BASE)]
-    messages, _ = answers(frames)
+    messages, _ = outputs(frames)
     check_promises(messages)
     found = worlds(messages)
     assert BASE[-1].stamp_ns - max(found) < 60_000_000
@@ -171,7 +171,7 @@ def test_one_bad_frame_is_over_within_a_second(kind: str, reference: dict[int, P
     ("factor", "cause"), [(0.1, ""), (0.3, ""), (2, ""), (2.4, ""), (3, "body_too_large"), (0, "body_too_small")]
 )
 def test_a_body_of_another_size_is_known_or_said_not_to_be_and_one_that_nobody_is_refused(factor: float, cause: str):
-    messages, counts = answers([scaled(factor)(frame) for frame in BASE[:12]])
+    messages, counts = outputs([scaled(factor)(frame) for frame in BASE[:12]])
     check_promises(messages)
     bodies = [body for m in messages if isinstance(m, PoseWorld) for body in m.bodies]
     assert bool(bodies) == (not cause)
@@ -183,7 +183,7 @@ def test_a_body_of_another_size_is_known_or_said_not_to_be_and_one_that_nobody_i
 
 def test_a_sensor_that_was_put_elsewhere_is_believed_there_soon() -> None:
     moved = [with_pose(5.0)(frame) if k >= BAD else frame for k, frame in enumerate(BASE)]
-    messages, counts = answers(moved)
+    messages, counts = outputs(moved)
     check_promises(messages)
     assert counts["sensor_moved"] == 1
     assert counts["sensor_pose_jumped"] == 7, "a fifth of a second"
@@ -196,7 +196,7 @@ def test_a_sensor_that_moves_is_never_doubted() -> None:
     for k, frame in enumerate(BASE):
         turned = np.array([0.0, 0.0, np.sin(0.1 * k), np.cos(0.1 * k)])
         frames.append(replace(frame, sensor_pose=Pose(np.array([0.15 * k, 0.0, 0.0]), turned)))  # 4.5 m/s and 6 rad/s
-    assert not answers(frames)[1]["sensor_pose_jumped"]
+    assert not outputs(frames)[1]["sensor_pose_jumped"]
 
 
 NUMBERS = st.one_of(
@@ -237,7 +237,7 @@ def evil_frames(draw: st.DrawFn) -> list[PoseRaw]:
 @given(evil_frames())
 @settings(max_examples=10, deadline=None)
 def test_what_goes_out_keeps_its_promises_whatever_comes_in(frames: list[PoseRaw]) -> None:
-    check_promises(answers(frames)[0])
+    check_promises(outputs(frames)[0])
 
 
 KILLED, LASTING = CONTEXT + 50, CONTEXT + 100

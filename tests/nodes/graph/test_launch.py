@@ -297,7 +297,7 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
     assert given == [({"port": 7}, settings.calibration)]
 
 
-@pytest.mark.parametrize(("text", "said"), [
+@pytest.mark.parametrize(("text", "match"), [
     ('plugins = {robot = "acme:ROBOT"}', "robot: acme:ROBOT cannot be imported: .*install its package"),
     ('plugins = {robot = "nobody:ROBOT"}', "cannot be imported: No module named 'nobody'"),
     ('plugins = {robot = "acme"}', "expected module:name, got 'acme'"),
@@ -305,7 +305,7 @@ def test_a_source_of_another_package_gets_its_options(package: Any, tmp_path: Pa
     ('plugins = {prior = "acme:OTHER"}', "there is a node of that name already"),
     ('[input]\nsource = "acme:opens"', r"\[input\] source: acme:opens cannot be imported"),
 ])  # fmt: skip
-def test_what_is_no_plugin_is_said(package: Any, tmp_path: Path, text: str, said: str) -> None:
+def test_what_is_no_plugin_is_said(package: Any, tmp_path: Path, text: str, match: str) -> None:
     package.TEXT, package.OTHER = "text", NodeDeclaration("acme:Node")
-    with pytest.raises(LaunchError, match=said):
+    with pytest.raises(LaunchError, match=match):
         open_input(read(tmp_path / "a.toml", text))

@@ -120,8 +120,8 @@ def test_a_server_that_waited_for_them_processes_all(clock: VirtualClock, monkey
     assert inbox.overrun == 0
 
 
-def test_kiosks_share_what_time_there_is(clock: VirtualClock) -> None:
-    names = [f"kiosk {k}" for k in range(20)]
+def test_clients_share_what_time_there_is(clock: VirtualClock) -> None:
+    names = [f"client {k}" for k in range(20)]
     inbox = Inbox([camera(clock, 20.0, name) for name in names], limit=8, clock=clock)  # type: ignore[misc]
     worked, end_ns = dict.fromkeys(names, 0), clock.time_ns + 19 * 10**9
     while clock.time_ns < end_ns:
@@ -146,7 +146,7 @@ def test_a_late_node_keeps_the_newest_frames_the_end_of_the_stream_and_the_news(
 
 
 def of_sources(count: int) -> list[PoseRaw]:
-    return [dataclasses.replace(raw(0), source=f"kiosk {k}") for k in range(count)]
+    return [dataclasses.replace(raw(0), source=f"client {k}") for k in range(count)]
 
 
 def test_the_streams_of_one_publisher_do_not_displace_each_other_and_fill_no_memory(clock: VirtualClock) -> None:
@@ -280,9 +280,9 @@ def test_a_gap_of_our_own_making_resets_no_body(lost: int) -> None:
     assert not prior.counters["stream_gap"]
     assert after[-1].bodies[0].id == before[-1].bodies[0].id
     np.testing.assert_allclose(after[-1].bodies[0].bone_lengths, bones, atol=0.01)
-    answered = after[-1]
-    truth = frames[-1 - round(answered.delay_frames)].bodies[0].positions
-    assert np.linalg.norm(answered.bodies[0].positions - truth, axis=1).max() < 0.1
+    newest = after[-1]
+    truth = frames[-1 - round(newest.delay_frames)].bodies[0].positions
+    assert np.linalg.norm(newest.bodies[0].positions - truth, axis=1).max() < 0.1
 
 
 def test_a_server_that_is_late_skips_frames_and_not_bodies() -> None:
@@ -310,7 +310,7 @@ def test_a_tracker_whose_messages_are_dropped_has_not_stopped_and_streams_take_t
     for k in range(45):
         clock.time_ns += FRAME_NS
         for n in range(10):
-            message = dataclasses.replace(raw(0, walking(k)), source=f"kiosk {n}", stamp_ns=clock.time_ns)
+            message = dataclasses.replace(raw(0, walking(k)), source=f"client {n}", stamp_ns=clock.time_ns)
             body = message.bodies[0]
             message.bodies = [dataclasses.replace(body, positions=body.positions * upside_down)]
             checks.see(message, clock.time_ns)
@@ -361,17 +361,17 @@ def test_a_live_stream_is_published_for_nobody_while_a_node_is_away(make_launch:
 FRAMES = 25
 
 
-def kiosk(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
-    """A kiosk's stream, its clock so far ahead."""
+def client(name: str, bodies: int, ahead_ns: int) -> list[PoseRaw]:
+    """A client's stream, its clock so far ahead."""
     return [dataclasses.replace(m, source=name, stamp_ns=m.stamp_ns + ahead_ns) for m in walk(FRAMES, bodies)]
 
 
 @pytest.mark.parametrize("secret", [False, True])
-def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualClock, secret: bool) -> None:
-    streams = {"door": kiosk("door", 1, 0), "desk": kiosk("desk", 2, 3_600_000_000_000)}
-    # kiosks and server have the same keys
+def test_two_clients_and_a_server(make_launch, tmp_path: Path, clock: VirtualClock, secret: bool) -> None:
+    streams = {"door": client("door", 1, 0), "desk": client("desk", 2, 3_600_000_000_000)}
+    # clients and server have the same keys
     keys = create_keys(tmp_path / "keys") if secret else None
-    answers: dict[str, list[PoseWorld]] = defaultdict(list)
+    outputs: dict[str, list[PoseWorld]] = defaultdict(list)
     with ExitStack() as stack:
         door, desk = (stack.enter_context(Publisher("tcp://127.0.0.1:*", keys=keys)) for _ in streams)
         launch = make_launch(
@@ -380,8 +380,8 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
         )  # fmt: skip
         prior, trajectory = PriorNode(launch, clock), TrajectoryNode(launch, clock)
         stack.enter_context(running(prior, trajectory))
-        heard = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")
-        subscriber = stack.enter_context(heard)
+        listener = Subscriber(launch.transport.endpoint("trajectory"), POSE_WORLD, keys=keys, name="test")
+        subscriber = stack.enter_context(listener)
         for publisher in (door, desk):
             assert publisher.wait_for_subscribers({"prior"}, timeout_s=20)
         until(lambda: clock.sleep(33_333_333) or {"trajectory"} <= listeners(prior))
@@ -392,20 +392,20 @@ def test_two_kiosks_and_a_server(make_launch, tmp_path: Path, clock: VirtualCloc
                 publisher.publish(POSE_RAW, streams[name][k])
             until(lambda k=k: len(prior.health.compute_ns) == 2 * (k + 1))
 
-        def answered() -> bool:
+        def complete() -> bool:
             while received := subscriber.receive(0):
                 assert isinstance(received[1], PoseWorld)
-                answers[received[1].source].append(received[1])
-            return len(answers) == 2 and all(len(found) >= FRAMES - 6 for found in answers.values())
+                outputs[received[1].source].append(received[1])
+            return len(outputs) == 2 and all(len(found) >= FRAMES - 6 for found in outputs.values())
 
-        until(answered)
+        until(complete)
         assert door.subscribers == {"prior"}, "what a client says of itself is no matter of the trajectory's"
     assert prior.status()["streams"] == "2"
     for name, bodies in (("door", 1), ("desk", 2)):
         captured = {round(m.stamp_ns / 1e6) for m in streams[name]}
-        assert {round(m.stamp_ns / 1e6) for m in answers[name]} <= captured, "stamps are of its own clock"
-        assert {body.id for m in answers[name] for body in m.bodies} == set(range(bodies))
-        assert all(len(m.bodies) == bodies for m in answers[name])
+        assert {round(m.stamp_ns / 1e6) for m in outputs[name]} <= captured, "stamps are of its own clock"
+        assert {body.id for m in outputs[name] for body in m.bodies} == set(range(bodies))
+        assert all(len(m.bodies) == bodies for m in outputs[name])
 
 
 def test_what_is_garbled_or_lacks_keys_is_reported_with_the_address(make_launch, clock: VirtualClock) -> None:
@@ -431,7 +431,7 @@ def test_counts_of_a_client_that_came_back_under_another_name_stay(make_launch: 
     assert node.status()["refused.sensor_pose_invalid"] == "3"
 
 
-def test_what_a_server_cannot_be_and_its_launch_file_goes_with_the_kiosks(make_launch: Callable[..., Launch]) -> None:
+def test_what_a_server_cannot_be_and_its_launch_file_goes_with_the_clients(make_launch: Callable[..., Launch]) -> None:
     of = {"server__clients": '["tcp://127.0.0.1:1"]', "transport__lossless": "false"}
     for wrong, expected in (
         ({"nodes": '["pose_input", "prior"]'}, "have their own pose_input"),

@@ -37,7 +37,7 @@ def test_from_a_recording_to_a_recording_though_the_prior_is_killed_on_the_way(s
     with RecordingReader(tmp_path / "out") as reader:
         assert reader.complete
         assert reader.count(POSE_RAW) == 151, "the recorder heard every frame"
-        assert reader.count(POSE_CLEAN) == reader.count(POSE_WORLD) == 151, "each answered, and once"
+        assert reader.count(POSE_CLEAN) == reader.count(POSE_WORLD) == 151, "each once"
         for topic in (POSE_RAW, POSE_CLEAN, POSE_WORLD):
             *_, last = reader.messages([topic])
             assert isinstance(last.message, PoseRaw | PoseClean | PoseWorld)
@@ -120,7 +120,7 @@ def test_a_node_that_hangs_is_noticed_and_started_again(start: Any, recording: P
     run.until_running("pose_input")
     os.kill(run.pid("pose_input"), signal.SIGSTOP)
     until(lambda: run.node("pose_input")["state"] == "stale", timeout_s=30)
-    assert "rate_hz" not in run.node("pose_input"), "what it said before does not hold"
+    assert "rate_hz" not in run.node("pose_input"), "what it reported before does not hold"
     until(lambda: run.node("pose_input")["restarts"] == 1, timeout_s=30)
     run.until_running("pose_input")
     assert run.end()[0] == 0
@@ -195,9 +195,9 @@ def test_systemd_is_told_when_all_are_ready_and_that_they_live(folder: Path, rec
         systemd.settimeout(120)
         monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "notify"))
         run: Run = start("--input", str(recording), "--loop", *INPUT_ALONE)
-        told: list[str] = []
-        while "READY=1" not in told[:-3]:
-            told.append(systemd.recv(64).decode())
+        states: list[str] = []
+        while "READY=1" not in states[:-3]:
+            states.append(systemd.recv(64).decode())
         assert run.end()[0] == 0
-    assert told.count("READY=1") == 1, "once, by the run and not by its nodes"
-    assert told[-1] == "WATCHDOG=1"
+    assert states.count("READY=1") == 1, "once, by the run and not by its nodes"
+    assert states[-1] == "WATCHDOG=1"

@@ -38,7 +38,7 @@ def clean(message: PoseRaw) -> PoseClean:
 
 
 class Echo(Node):
-    """In the prior's place: answers every frame, but for those whose skeleton it is told to stumble over."""
+    """In the prior's place: publishes for every frame, except those whose skeleton it is to stumble over."""
 
     name = "prior"
 
@@ -95,7 +95,7 @@ def test_a_message_that_fails_is_counted_and_the_next_one_is_served(make_launch:
         for i in range(6):
             source.publish(POSE_RAW, raw(i, skeleton="bad" if i % 2 else "smpl22"))
         listener.take_until(lambda: len(listener.got) == 3)
-        until(lambda: node.health.counts["refused.ArithmeticError"] == 3)  # the last comes after the third answer
+        until(lambda: node.health.counts["refused.ArithmeticError"] == 3)  # the last comes after the third output
     assert sum("stumbled" in (record.exc_text or "") for record in caplog.records) == 1, "logged once"
     assert node.diagnostics().values["refused.ArithmeticError"] == "3"
 
@@ -233,8 +233,8 @@ def test_a_clock_that_is_set_makes_no_frame_late(make_launch: Callable[..., Laun
 
 def test_events_are_sent_when_something_changes_and_once_a_second_and_the_end_of_the_stream_is_passed_on() -> None:
     stream = EventStream(EventSettings())
-    told = [(world.stamp_ns, stream.process(world)) for world in messages_on(POSE_WORLD, 6.0)]
-    sent = [(stamp_ns, events) for stamp_ns, events in told if events]
+    outputs = [(world.stamp_ns, stream.process(world)) for world in messages_on(POSE_WORLD, 6.0)]
+    sent = [(stamp_ns, events) for stamp_ns, events in outputs if events]
     assert all(stamp_ns == events.stamp_ns for stamp_ns, events in sent)
     changed = [any(event.phase != Phase.HOLDS for event in events.events) for _, events in sent]
     assert any(changed)

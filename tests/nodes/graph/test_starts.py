@@ -46,8 +46,8 @@ def test_nohup_is_obeyed() -> None:
 
 def test_loops_that_are_loaded_are_not_said_to_be_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    told = "import os, sys; os.write(int(sys.argv[1]), b'one\\ntwo\\nthree\\n')"
-    monkeypatch.setattr(loops_module, "own_command", lambda _, part, pipe: [sys.executable, "-c", told, pipe])
+    program = "import os, sys; os.write(int(sys.argv[1]), b'one\\ntwo\\nthree\\n')"
+    monkeypatch.setattr(loops_module, "own_command", lambda _, part, pipe: [sys.executable, "-c", program, pipe])
     (folder,) = loop_cache.folders()
     folder.mkdir(parents=True)
     monkeypatch.setattr(loop_cache, "writable", lambda: folder)  # which is cached
@@ -55,10 +55,10 @@ def test_loops_that_are_loaded_are_not_said_to_be_compiled(tmp_path: Path, monke
         if name:
             (folder / name).touch()
         (folder / loop_cache.COMPLETE).unlink(missing_ok=True)
-        said: list[str] = []
-        loops_module.compile_missing(said.append)
-        assert ("has changed" in said[0]) == bool(name)
-        assert said[-1].startswith(f"compiled {loaded} in ")
+        lines: list[str] = []
+        loops_module.compile_missing(lines.append)
+        assert ("has changed" in lines[0]) == bool(name)
+        assert lines[-1].startswith(f"compiled {loaded} in ")
 
 
 def test_a_second_run_is_refused_and_the_first_is_left_alone(start: Any, recording: Path, folder: Path) -> None:

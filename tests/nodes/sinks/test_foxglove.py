@@ -53,12 +53,12 @@ def first_message(port: int, topic: str) -> tuple[dict[str, Any], bytes]:
     with client.connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as connection:
         offered: dict[str, dict[str, Any]] = {}
         while topic not in offered:
-            told = json.loads(connection.recv(20))
-            offered |= {channel["topic"]: channel for channel in told.get("channels", ())}
+            offer = json.loads(connection.recv(20))
+            offered |= {channel["topic"]: channel for channel in offer.get("channels", ())}
         asked = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": offered[topic]["id"]}]}
         connection.send(json.dumps(asked))
-        while not isinstance(said := connection.recv(20), bytes) or said[0] != 1:
+        while not isinstance(frame := connection.recv(20), bytes) or frame[0] != 1:
             # the SDK offers a channel a moment before it knows it, and refuses who subscribes in between
-            if isinstance(said, str) and "unknown channel" in said.lower():
+            if isinstance(frame, str) and "unknown channel" in frame.lower():
                 connection.send(json.dumps(asked))
-        return offered[topic], said[13:]  # after four bytes of subscription and eight of time
+        return offered[topic], frame[13:]  # after four bytes of subscription and eight of time

@@ -219,17 +219,17 @@ def test_a_pose_that_is_not_known_moves_nothing(robot: Robot) -> None:
     np.testing.assert_array_equal(before.joints, after.joints)
 
 
-@pytest.mark.parametrize(("old", "new", "said"), [
+@pytest.mark.parametrize(("old", "new", "match"), [
     ("</robot>", "", "is no URDF"),
     ('lower="-0.09" upper="2.88"', 'lower="2.88" upper="-0.09"', "left_knee_joint: expected lower < upper"),
     ('"left_knee_joint" type="revolute"', '"left_knee_joint" type="continuous"', "expected revolute or prismatic"),
     ("left_knee_link", "left_middle_link", "no link is named for left_knee: with links"),
     ('<child link="waist_yaw_link"/>', '<child link="waist_roll_link"/>', "expected one link without a parent"),
 ])  # fmt: skip
-def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, match: str) -> None:
     file = tmp_path / "robot.urdf"
     file.write_text(URDF.read_text().replace(old, new))
-    with pytest.raises(LaunchError, match=said):
+    with pytest.raises(LaunchError, match=match):
         load_robot(file, {})
     if new == "left_middle_link":
         assert load_robot(file, {"left_knee": new}).links["left_knee"] == new
@@ -238,10 +238,10 @@ def test_what_is_wrong_with_a_urdf_is_said(tmp_path: Path, old: str, new: str, s
 
 
 def test_the_node_sends_datagrams(make_launch: Callable[..., Launch]) -> None:
-    said = json.loads(first_datagram(make_launch, RetargetNode, cycle(worlds("idle")), retarget__urdf=str(URDF)))
-    assert len(said["joints"]) == 29
-    assert len(said["root"]) == 7
-    assert set(said["stands"]) == {"left", "right"}
+    sent = json.loads(first_datagram(make_launch, RetargetNode, cycle(worlds("idle")), retarget__urdf=str(URDF)))
+    assert len(sent["joints"]) == 29
+    assert len(sent["root"]) == 7
+    assert set(sent["stands"]) == {"left", "right"}
 
 
 def test_the_command_follows_the_cleaned_poses_and_not_the_truth_beside_them(tmp_path: Path) -> None:
@@ -274,9 +274,9 @@ def test_the_command_writes_csv_and_npz_and_tells_what_is_wrong(tmp_path: Path, 
     assert retarget("in.npz", "out.csv", *given) == 2
     assert "--force to replace it" in capsys.readouterr().err
     assert [retarget("in.npz", "out.bvh", *given), retarget("in.npz", "out2.csv")] == [2, 2]
-    said = capsys.readouterr().err
-    assert "expected --urdf FILE" in said
-    assert str(URDF) in said, "which is there wherever the package is installed"
+    printed = capsys.readouterr().err
+    assert "expected --urdf FILE" in printed
+    assert str(URDF) in printed, "which is there wherever the package is installed"
     assert retarget("y.npz", "y.csv", *given) == 1
     assert "up_axis" in capsys.readouterr().err
 

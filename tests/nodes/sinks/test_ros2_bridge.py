@@ -97,16 +97,16 @@ def test_a_ros_node_hears_bodies(make_launch: Callable[..., Launch], tmp_path: P
         running(bridge),
     ):
         assert listener.stdout
-        said: list[str] = []
-        threading.Thread(target=lambda: said.extend(listener.stdout or ()), daemon=True).start()
+        lines: list[str] = []
+        threading.Thread(target=lambda: lines.extend(listener.stdout or ()), daemon=True).start()
 
-        def told() -> bool:
+        def received() -> bool:
             publisher.publish(POSE_WORLD, next(turn), timeout_s=1)
             publisher.publish(DIAGNOSTICS, NEWS)
-            return len(said) > 1
+            return len(lines) > 1
 
-        until(told, timeout_s=120)
-    heard = json.loads(said[-1])
+        until(received, timeout_s=120)
+    heard = json.loads(lines[-1])
     assert not bridge.health.counts
     body = next(message for message in worlds if message.stamp_ns == heard["stamp"]).bodies[1]
     assert (heard["frames"], heard["position"]) == (["odom", "body_b1"], body.root_position.tolist())
@@ -168,9 +168,9 @@ def test_the_whole_message_goes_out_in_its_own_type_and_transforms_lead_to_every
     sent = {topic: cdr for topic, _, cdr, _ in kept.sent}
     assert decode(POSE_CLEAN, sent["steadypose/pose_clean"]) == clean
     assert decode(POSE_WORLD, sent["steadypose/pose_world"]) == dataclasses.replace(world, frame_id="odom")
-    told = kept.of("tf")[-1]
-    buffer.add(told, static=False)
-    assert {it.child_frame_id for it in told.transforms} == {f"{link}_{b}" for link in LINKS for b in ("b0", "b1")}
+    message = kept.of("tf")[-1]
+    buffer.add(message, static=False)
+    assert {it.child_frame_id for it in message.transforms} == {f"{link}_{b}" for link in LINKS for b in ("b0", "b1")}
     for name, body in zip(("b0", "b1"), world.bodies, strict=True):
         for link, (place, turned) in frames(body).items():
             at, quaternion = buffer.lookup("odom", f"{link}_{name}", world.stamp_ns)
@@ -187,9 +187,9 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(stream: Stream
     still = dataclasses.replace(stream[0][-1], frame_id="camera", sensor_pose=pose, calibrated=True)
     for _ in range(3):
         topics.send(still)
-    (told,) = kept.of("tf_static")
+    (message,) = kept.of("tf_static")
     assert [latched for topic, _, _, latched in kept.sent if topic == "tf_static"] == [True]
-    (transform,) = told.transforms
+    (transform,) = message.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "camera")
     assert transform.transform.translation.y == 2.0
     for step in range(3):
@@ -200,7 +200,7 @@ def test_a_sensor_that_stands_is_static_and_one_that_moves_is_not(stream: Stream
     topics.send(other)
     topics.send(third)
     topics.send(dataclasses.replace(other, sensor_pose=Pose(pose.position + 1, pose.orientation)))
-    held = [{it.child_frame_id for it in told.transforms} for told in kept.of("tf_static")]
+    held = [{it.child_frame_id for it in message.transforms} for message in kept.of("tf_static")]
     assert held == [{"camera"}, set(), {"other"}, {"other", "third"}, {"third"}], "each has all that stand still"
     silent = Kept()
     for sensor_tf, message in (
@@ -327,9 +327,9 @@ def join(request: pytest.FixtureRequest, ros: None) -> Iterator[Callable[[], Con
 
 
 def test_who_joins_late_gets_what_is_latched(join: Callable[[], Connection]) -> None:
-    said = serialise(new("std_msgs/msg/String", data="a robot"))
+    text = serialise(new("std_msgs/msg/String", data="a robot"))
     first = join()
-    first.publisher("description", "std_msgs/msg/String", latched=True)(said)
+    first.publisher("description", "std_msgs/msg/String", latched=True)(text)
     heard: list[bytes] = []
     late = join()
     late.subscribe("description", "std_msgs/msg/String", heard.append, latched=True)
@@ -353,18 +353,18 @@ def forward(description: str, angles: dict[str, float], suffix: str) -> dict[str
     """(4, 4) poses of a URDF's links in the frame of its root, by the textbook."""
     robot = ElementTree.fromstring(description)
 
-    def told(joint: ElementTree.Element, part: str, key: str) -> str:
+    def attribute(joint: ElementTree.Element, part: str, key: str) -> str:
         return next(joint.iter(part)).attrib[key]
 
     poses = {f"body_{suffix}": np.eye(4)}
     for joint in robot.iter("joint"):  # which comes after the one it hangs from
         here = np.eye(4)
-        here[:3, 3] = [float(x) for x in told(joint, "origin", "xyz").split()]
+        here[:3, 3] = [float(x) for x in attribute(joint, "origin", "xyz").split()]
         if joint.get("type") == "revolute":
-            axis = np.array([float(x) for x in told(joint, "axis", "xyz").split()])
+            axis = np.array([float(x) for x in attribute(joint, "axis", "xyz").split()])
             angle = angles[joint.attrib["name"].removesuffix(f"_{suffix}")]
             here[:3, :3] = Rotation.from_rotvec(axis * angle).as_matrix()
-        poses[told(joint, "child", "link")] = poses[told(joint, "parent", "link")] @ here
+        poses[attribute(joint, "child", "link")] = poses[attribute(joint, "parent", "link")] @ here
     return poses
 
 

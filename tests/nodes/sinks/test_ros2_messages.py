@@ -90,9 +90,9 @@ def sourced(script: str, folder: Path, python: Path, *arguments: str) -> Abstrac
 def listener(folder: Path) -> Iterator[list[str]]:
     """A ROS 2 node with the generated types; what it says, line by line: that it is ready, and what it heard."""
     with sourced(LISTENER, folder, ROOT / ".ros2/venv/bin/python") as it:
-        said: list[str] = []
-        threading.Thread(target=lambda: said.extend(it.stdout or ()), daemon=True).start()
-        yield said
+        lines: list[str] = []
+        threading.Thread(target=lambda: lines.extend(it.stdout or ()), daemon=True).start()
+        yield lines
 
 
 def plain(value: Any) -> Any:
@@ -127,22 +127,22 @@ def test_a_ros_node_receives_whole_messages(make_launch, tmp_path: Path, stream:
     launch = make_launch(nodes='["pose_input", "prior", "trajectory", "ros2_bridge"]', transport__lossless="true")
     turn = itertools.cycle(range(60))
     with (
-        listener(tmp_path) as said,
+        listener(tmp_path) as lines,
         Publisher(launch.transport.endpoint("pose_input"), reliable={"ros2_bridge"}) as raw,
         Publisher(launch.transport.endpoint("prior"), reliable={"ros2_bridge"}) as clean,
         Publisher(launch.transport.endpoint("trajectory"), reliable={"ros2_bridge"}) as world,
         running(Ros2BridgeNode(launch)),
     ):
 
-        def told() -> bool:
+        def all_received() -> bool:
             index = next(turn)
             for publisher, topic in ((raw, POSE_RAW), (clean, POSE_CLEAN), (world, POSE_WORLD)):
                 publisher.publish(topic, stream[topic][index], timeout_s=1)
-            return len(said) > 1
+            return len(lines) > 1
 
-        until(told, timeout_s=120)
-    answer = json.loads(said[-1])
-    for topic, heard in answer["heard"].items():
+        until(all_received, timeout_s=120)
+    result = json.loads(lines[-1])
+    for topic, heard in result["heard"].items():
         stamp = heard["header"]["stamp"]
         (sent,) = [
             message
@@ -151,7 +151,7 @@ def test_a_ros_node_receives_whole_messages(make_launch, tmp_path: Path, stream:
         ]
         np.testing.assert_equal(heard, fields_of(sent))
         assert len(heard["bodies"]) == 2
-    constants = answer["constants"]
+    constants = result["constants"]
     for state in JointState:
         assert constants[f"STATE_{state.name}"] == state
     for tracking in Tracking:
@@ -164,7 +164,7 @@ def test_a_sourced_ros_carries_them_as_well(tmp_path: Path, stream: dict[str, li
     last = {topic.replace("/", "_"): found[-1] for topic, found in stream.items()}
     for topic, message in last.items():
         (folder / f"{topic}.{KINDS[topic]}").write_bytes(encode(message))
-    with listener(tmp_path) as said, sourced(SENDER, tmp_path, Path(sys.executable), str(folder)):
-        until(lambda: len(said) > 1, timeout_s=120)
-    for topic, heard in json.loads(said[-1])["heard"].items():
+    with listener(tmp_path) as lines, sourced(SENDER, tmp_path, Path(sys.executable), str(folder)):
+        until(lambda: len(lines) > 1, timeout_s=120)
+    for topic, heard in json.loads(lines[-1])["heard"].items():
         np.testing.assert_equal(heard, fields_of(last[topic]))

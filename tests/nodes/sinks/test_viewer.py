@@ -262,11 +262,11 @@ def test_the_node_draws_what_is_published_and_ends_with_its_server(tmp_path: Pat
 
 def test_the_page_may_call_nobody_but_this_server(server: ViewerServer) -> None:
     """By itself Rerun's page sends telemetry and asks for news; its policy has the browser refuse that."""
-    with urllib.request.urlopen(server.url, timeout=20) as answer:
-        page = answer.read().lower()
+    with urllib.request.urlopen(server.url, timeout=20) as response:
+        page = response.read().lower()
         assert b"<html" in page
         assert b"rerun" in page
-        rules = dict(rule.strip().split(" ", 1) for rule in answer.headers["Content-Security-Policy"].split(";"))
+        rules = dict(rule.strip().split(" ", 1) for rule in response.headers["Content-Security-Policy"].split(";"))
     assert rules["connect-src"].split() == ["'self'", "blob:", "data:"]
     assert not [word for rule in rules.values() for word in rule.split() if word in ("*", "http:", "https:")]
 
@@ -281,12 +281,12 @@ def test_a_name_that_was_made_to_lead_here_gets_nothing(server: ViewerServer) ->
 def test_who_does_not_know_the_token_sees_no_drawings(server: ViewerServer) -> None:
     recording = server.connect()
     recording.log("a", rr.TextLog("somebody"))
-    with urllib.request.urlopen(server.data_url, timeout=20) as answer:
-        assert answer.read(3) == b"RRF"
+    with urllib.request.urlopen(server.data_url, timeout=20) as response:
+        assert response.read(3) == b"RRF"
     at, token, name = server.data_url.rsplit("/", 2)
     for guess in ("", f"/{name}", f"/{'x' * len(token)}/{name}", f"/{token[:-1]}/{name}", f"/{token}/./{name}"):
-        with suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as answer:
-            assert not answer.read().startswith(b"RRF"), guess
+        with suppress(urllib.error.HTTPError), urllib.request.urlopen(at + guess, timeout=20) as response:
+            assert not response.read().startswith(b"RRF"), guess
     recording.disconnect()
 
 

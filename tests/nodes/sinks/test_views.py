@@ -55,8 +55,8 @@ def sent() -> Kept:
 
 
 def frames(sent: Kept) -> set[str]:
-    told = [one for topic in ("tf", "tf_static") for message in sent.of(topic) for one in message.transforms]
-    return {name for one in told for name in (one.header.frame_id, one.child_frame_id)}
+    transforms = [one for topic in ("tf", "tf_static") for message in sent.of(topic) for one in message.transforms]
+    return {name for one in transforms for name in (one.header.frame_id, one.child_frame_id)}
 
 
 def published(sent: Kept) -> dict[str, tuple[str, bool]]:

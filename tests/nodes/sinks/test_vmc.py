@@ -35,11 +35,11 @@ def test_the_bones_give_the_body_back_in_unitys_axes_and_nobody_is_said_too() ->
     body = world().bodies[0]
     bundles = osc_bundles(1.5, body)
     assert all(len(data) < 1400 for data in bundles)
-    said = messages(bundles)
-    assert said[:3] == [
+    sent = messages(bundles)
+    assert sent[:3] == [
         ("/VMC/Ext/OK", [1]), ("/VMC/Ext/T", [1.5]), ("/VMC/Ext/Root/Pos", ["root", 0, 0, 0, 0, 0, 0, 1]),
     ]  # fmt: skip
-    bones = {params[0]: np.array(params[1:], dtype=float) for address, params in said if address.endswith("Bone/Pos")}
+    bones = {params[0]: np.array(params[1:], dtype=float) for address, params in sent if address.endswith("Bone/Pos")}
     assert tuple(bones) == BONES
     assert BONES[J["left_elbow"]] == "LeftLowerArm"
     # as Unity places them: in left-handed axes a quaternion's product is the same
@@ -56,5 +56,5 @@ def test_the_bones_give_the_body_back_in_unitys_axes_and_nobody_is_said_too() ->
 def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:
     one = world()
     worlds = (dataclasses.replace(one, stamp_ns=stamp_ns) for stamp_ns in count(0, 33_333_333))
-    said = messages([first_datagram(make_launch, VmcNode, worlds)])
-    assert said[0] == ("/VMC/Ext/OK", [1]), "from the first moment on, though stamps count from 0"
+    sent = messages([first_datagram(make_launch, VmcNode, worlds)])
+    assert sent[0] == ("/VMC/Ext/OK", [1]), "from the first moment on, though stamps count from 0"

@@ -42,8 +42,8 @@ def server() -> Iterator[WebServer]:
 def get(server: WebServer, path: str, host: str = "127.0.0.1") -> tuple[int, dict[str, str], str]:
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     connection.request("GET", path, headers={"Host": host})
-    answer = connection.getresponse()
-    return answer.status, dict(answer.getheaders()), answer.read().decode()
+    response = connection.getresponse()
+    return response.status, dict(response.getheaders()), response.read().decode()
 
 
 def client(server: WebServer, token: str = TOKEN, **options: Any) -> Any:
@@ -158,9 +158,9 @@ def test_messages_as_json() -> None:
     message.bodies[0].positions[3] = np.nan
     message.bodies[0].sigma[4] = np.inf
     message.bodies[0].contacts[2] = np.nan
-    said = json.loads(to_json(message) or "")
-    (body,) = said["bodies"]
-    assert (said["topic"], said["stamp"], said["frame"]) == ("pose/world", 1.5, "world")
+    as_json = json.loads(to_json(message) or "")
+    (body,) = as_json["bodies"]
+    assert (as_json["topic"], as_json["stamp"], as_json["frame"]) == ("pose/world", 1.5, "world")
     assert (body["id"], body["tracking"], body["positions"][2]) == (7, "COASTING", [6.0, 7.0, 8.0])
     assert body["positions"][3] == [None] * 3
     np.testing.assert_allclose(body["rotations"], message.bodies[0].rotations, atol=1e-4)

@@ -60,7 +60,7 @@ def send(server: WebServer, topic: str, message: Message) -> None:
     server.send(topic, text, replaces=topic != POSE_EVENTS)
 
 
-def told(kind: EventKind, phase: Phase, hand: Hand = Hand.NONE, body: int = 7) -> PoseEvents:
+def event(kind: EventKind, phase: Phase, hand: Hand = Hand.NONE, body: int = 7) -> PoseEvents:
     return PoseEvents(10**9, "world", "test", [Event(body, kind, phase, hand, 0.9, np.zeros(3), 10**9)])
 
 
@@ -73,7 +73,7 @@ def test_the_page_draws_bodies_and_says_what_they_do_and_how_the_nodes_are(serve
     page = opened("/")
     for message in messages_on(POSE_WORLD, 1.0):
         send(server, POSE_WORLD, message)
-    send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT))
+    send(server, POSE_EVENTS, event(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT))
     send(server, "diagnostics", diagnostics())
     until(lambda: page.text_content("#events") == "7: left hand raised", timeout_s=SOON_S)
     until(lambda: "prior" in page.text_content("#health"), timeout_s=SOON_S)
@@ -96,7 +96,7 @@ def test_bodies_of_all_clients_are_drawn_under_their_names_until_their_stream_en
         send(server, f"{POSE_WORLD}/{source}", dataclasses.replace(last, source=source))
     names = [f"{source} {body.id}" for source in ("Küche 1", "厨房") for body in last.bodies]
     until(lambda: sorted(page.evaluate("globalThis.labels")) == sorted(names), timeout_s=SOON_S)
-    send(server, POSE_EVENTS, dataclasses.replace(told(EventKind.HAND_RAISED, Phase.BEGINS, body=1), source="厨房"))
+    send(server, POSE_EVENTS, dataclasses.replace(event(EventKind.HAND_RAISED, Phase.BEGINS, body=1), source="厨房"))
     until(lambda: page.text_content("#events") == "厨房 1: hand raised", timeout_s=SOON_S)
     send(server, f"{POSE_WORLD}/厨房", dataclasses.replace(last, source="厨房", bodies=[], end_of_stream=True))
     until(lambda: page.evaluate("globalThis.labels") == [f"{body.id}" for body in last.bodies], timeout_s=SOON_S)
@@ -180,15 +180,15 @@ def test_a_kiosk_starts_when_a_hand_is_raised_and_is_over_when_they_have_left(se
 
     says("Welcome")
     until(lambda: server.clients == 1)
-    send(server, POSE_EVENTS, told(EventKind.FACES_SENSOR, Phase.BEGINS))
+    send(server, POSE_EVENTS, event(EventKind.FACES_SENSOR, Phase.BEGINS))
     says("Raise a hand to start")
-    send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.RIGHT))
+    send(server, POSE_EVENTS, event(EventKind.HAND_RAISED, Phase.BEGINS, Hand.RIGHT))
     says("Here we go!")
     assert page.inner_text("#who") == "started by visitor 7, with the right hand"
-    for another in (told(EventKind.LEFT, Phase.BEGINS, body=8), at_the_door(told(EventKind.LEFT, Phase.BEGINS))):
+    for another in (event(EventKind.LEFT, Phase.BEGINS, body=8), at_the_door(event(EventKind.LEFT, Phase.BEGINS))):
         send(server, POSE_EVENTS, another)
-    send(server, POSE_EVENTS, told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT, body=9))
-    send(server, POSE_EVENTS, told(EventKind.LEFT, Phase.BEGINS))  # ends it unless the visitor has become number 9
+    send(server, POSE_EVENTS, event(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT, body=9))
+    send(server, POSE_EVENTS, event(EventKind.LEFT, Phase.BEGINS))  # ends it unless the visitor has become number 9
     says("Welcome")
 
 
@@ -199,16 +199,16 @@ def at_the_door(message: PoseEvents) -> PoseEvents:
 def test_a_kiosk_does_not_forget_who_faces_one_camera_when_nobody_faces_another(server: WebServer, opened: Any) -> None:
     page = opened("/kiosk")
     until(lambda: server.clients == 1)
-    send(server, POSE_EVENTS, told(EventKind.FACES_SENSOR, Phase.BEGINS))
-    send(server, POSE_EVENTS, at_the_door(told(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT)))
-    send(server, POSE_EVENTS, at_the_door(told(EventKind.LEFT, Phase.BEGINS)))
+    send(server, POSE_EVENTS, event(EventKind.FACES_SENSOR, Phase.BEGINS))
+    send(server, POSE_EVENTS, at_the_door(event(EventKind.HAND_RAISED, Phase.BEGINS, Hand.LEFT)))
+    send(server, POSE_EVENTS, at_the_door(event(EventKind.LEFT, Phase.BEGINS)))
     until(lambda: page.text_content("#text") == "Raise a hand to start", timeout_s=SOON_S)
 
 
 def test_the_script_names_a_joint_that_there_is_not(server: WebServer, opened: Any) -> None:
     page = opened("/")
     send(server, POSE_WORLD, messages_on(POSE_WORLD, 1.0)[0])
-    said = page.evaluate(
+    errors = page.evaluate(
         """async () => {
           const { connect } = await import("/steadypose.js");
           return new Promise((done) => connect().on("world", ({ bodies: [body] }) => {
@@ -216,5 +216,5 @@ def test_the_script_names_a_joint_that_there_is_not(server: WebServer, opened: A
           }));
         }"""
     )
-    assert said[0].startswith("no joint left_rist: there are pelvis, ")
-    assert len(said[1]) == 3
+    assert errors[0].startswith("no joint left_rist: there are pelvis, ")
+    assert len(errors[1]) == 3

@@ -143,7 +143,7 @@ def test_from_the_camera_to_the_world(make_launch: MakeLaunch, monkeypatch: pyte
     path = np.array([one.joints[0][hips].mean(axis=0)[[0, 2]] for one in scene])
     for world in worlds[4:]:
         seen = world.bodies[0].positions[[JOINTS.index("left_hip"), JOINTS.index("right_hip")]].mean(axis=0)
-        # a level camera: its x is the world's, its depth the world's y; how high it stands nobody told it
+        # a level camera: its x is the world's, its depth the world's y; how high it stands it is not told
         assert np.linalg.norm(path - seen[:2], axis=1).min() < 0.15, "they walk on the spot, which no root does"
         heights = world.bodies[0].positions[:, 2] - seen[2]
         assert np.nanmax(heights) == pytest.approx(0.6, abs=0.25), "upright: the neck, or the head"
@@ -295,8 +295,8 @@ def test_it_becomes_the_files_and_the_lens_that_the_other_steps_want(tmp_path: P
     calibrate(CalibrateOak(launch, tmp_path / "floor"))
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "floor.depth.png"), cv2.IMREAD_UNCHANGED), scene.depth)
     assert (tmp_path / "floor.png").is_file()
-    told = Launch.read(launch).settings(InputSettings).calibration
-    assert list(told.size) == [CAMERA.width, CAMERA.height]
-    assert list(told.focal) == pytest.approx([CAMERA.focal, CAMERA.focal])
+    saved = Launch.read(launch).settings(InputSettings).calibration
+    assert list(saved.size) == [CAMERA.width, CAMERA.height]
+    assert list(saved.focal) == pytest.approx([CAMERA.focal, CAMERA.focal])
     assert launch.read_text().startswith("# mine")
     assert "floor.depth.png --up 0.000 -0.980 0.199" in capsys.readouterr().out

@@ -125,7 +125,7 @@ def test_pose_arrays_hold_whole_bodies() -> None:
 FRAME_NS = 33_333_333
 
 
-def said(stamp_ns: int, parent: str, child: str, place: Any, turned: Rotation) -> Any:
+def tf_of(stamp_ns: int, parent: str, child: str, place: Any, turned: Rotation) -> Any:
     return tf_message([transform(stamp_ns, parent, child, np.asarray(place, float), turned.as_quat())])
 
 
@@ -141,7 +141,7 @@ def test_any_frame_in_any_other_is_the_product_of_matrices(seed: int, target: st
     rng, buffer, world = np.random.default_rng(seed), TransformBuffer(), {"map": np.eye(4)}
     for child, parent in tree.items():
         place, turned = rng.normal(size=3), Rotation.from_rotvec(rng.normal(size=3))
-        buffer.add(said(10, parent, child, place, turned), static=child in ("camera", "tool"))
+        buffer.add(tf_of(10, parent, child, place, turned), static=child in ("camera", "tool"))
         world[child] = world[parent] @ matrix(place, turned)
     source = data.draw(st.sampled_from(sorted(world)))
     place, quaternion = buffer.lookup(target, source, 10)
@@ -153,7 +153,7 @@ def test_between_two_stamps_it_is_interpolated_beyond_them_unknown_and_what_is_o
     buffer = TransformBuffer()
     for step in range(3):
         turned = Rotation.from_euler("z", 40 * step, degrees=True)
-        buffer.add(said(1000 + 100 * step, "odom", "base", [2.0 * step, 0, 0], turned), static=False)
+        buffer.add(tf_of(1000 + 100 * step, "odom", "base", [2.0 * step, 0, 0], turned), static=False)
     place, quaternion = buffer.lookup("odom", "base", 1150)
     np.testing.assert_allclose(place, [3.0, 0, 0])
     assert Rotation.from_quat(quaternion).as_euler("zyx", degrees=True)[0] == pytest.approx(60)
@@ -164,10 +164,10 @@ def test_between_two_stamps_it_is_interpolated_beyond_them_unknown_and_what_is_o
         buffer.lookup("odom", "camera", 1100)
     buffer, none = TransformBuffer(), Rotation.identity()
     for stamp_ns in (CACHE_NS, CACHE_NS * 3 // 2, CACHE_NS * 5 // 2):
-        buffer.add(said(stamp_ns, "odom", "base", [stamp_ns / 1e9, 0, 0], none), static=False)
+        buffer.add(tf_of(stamp_ns, "odom", "base", [stamp_ns / 1e9, 0, 0], none), static=False)
     with pytest.raises(TransformError):
         buffer.lookup("odom", "base", CACHE_NS)
-    buffer.add(said(5, "odom", "base", [7.0, 0, 0], none), static=False)
+    buffer.add(tf_of(5, "odom", "base", [7.0, 0, 0], none), static=False)
     assert buffer.lookup("odom", "base", 5)[0][0] == 7.0
     buffer.add(tf_message([transform(6, "odom", "base", np.full(3, np.nan), none.as_quat())]), static=False)
     assert buffer.lookup("odom", "base", 5)[0][0] == 7.0
@@ -198,10 +198,10 @@ def test_a_message_waits_for_the_transform_of_its_stamp(clock: VirtualClock, mon
     settings = TfSettings(fixed_frame="odom", sensor_frame="eye")
     source = TfSource(Given(frame, None, None), settings, clock, lambda _: robot)  # type: ignore[arg-type, return-value]
     frames = source.frames()
-    robot.queue = [("tf_static", said(0, "base", "eye", [0, 0, 1.5], Rotation.from_euler("z", 90, degrees=True)))]
-    robot.queue.append(("tf", said(1_000, "odom", "base", [0, 0, 0], Rotation.identity())))
-    assert next(frames) is None, "not yet: the robot has only said where it was before"
-    robot.queue = [("tf", said(3_000, "odom", "base", [4, 0, 0], Rotation.identity()))]
+    robot.queue = [("tf_static", tf_of(0, "base", "eye", [0, 0, 1.5], Rotation.from_euler("z", 90, degrees=True)))]
+    robot.queue.append(("tf", tf_of(1_000, "odom", "base", [0, 0, 0], Rotation.identity())))
+    assert next(frames) is None, "not yet: the robot has only sent where it was before"
+    robot.queue = [("tf", tf_of(3_000, "odom", "base", [4, 0, 0], Rotation.identity()))]
     found: Any = next(frames)
     assert found.calibrated
     np.testing.assert_allclose(found.sensor_pose.position, [2.0, 0, 1.5])

@@ -187,17 +187,17 @@ def test_a_video_is_a_recording_to_clean_with_mediapipes_own_model(video: Path) 
 
 
 def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
-    told = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
+    known = CalibrationSettings([640, 480], [500.0, 510.0], [330.0, 235.0], [-0.3, 0.1, 0.0, 0.0, 0.0])
     guessed, lens, half = (
         Lens(size, 1.05, calibration)
-        for size, calibration in (((640, 480), NOT_CALIBRATED), ((640, 480), told), ((320, 240), told))
+        for size, calibration in (((640, 480), NOT_CALIBRATED), ((640, 480), known), ((320, 240), known))
     )
     assert guessed.intrinsics[0, 0] == pytest.approx(320 / np.tan(0.525))
     points = np.array([[x, y, 2.0] for x in (-1.0, -0.3, 0.5, 1.0) for y in (-0.7, 0.1, 0.6)])
     for one, size in ((lens, (640, 480)), (half, (320, 240))):
         scale = size[0] / 640
         matrix = np.array([[500.0, 0, 330.0], [0, 510.0, 235.0], [0, 0, 1]])
-        bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(told.distortion))[0].reshape(-1, 2)
+        bent = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(known.distortion))[0].reshape(-1, 2)
         straight = points @ one.intrinsics.T
         straight = straight[:, :2] / straight[:, 2:]
         for (x, y), expected in zip((bent + 0.5) * scale - 0.5, straight, strict=True):
@@ -208,7 +208,7 @@ def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
     image = np.zeros((480, 640, 3), np.uint8)
     assert guessed.undistort(image) is image
     with pytest.raises(LaunchError, match="expected images of 640 x 480, got 1280 x 720: calibrate it"):
-        Lens((1280, 720), 1.05, told)
+        Lens((1280, 720), 1.05, known)
 
 
 def test_a_webcam_that_is_not_there_is_looked_for_again(video: Path, model: str, clock: VirtualClock) -> None:
