@@ -207,7 +207,7 @@ def test_a_lens_that_is_calibrated_is_used_for_images_of_any_size() -> None:
             np.testing.assert_allclose(shown, expected, atol=1.0)
     image = np.zeros((480, 640, 3), np.uint8)
     assert guessed.undistort(image) is image
-    with pytest.raises(LaunchError, match="expected images of 640 x 480, got 1280 x 720: calibrate it"):
+    with pytest.raises(LaunchError, match="expected images of 640 x 480, got 1280 x 720; calibrate it"):
         Lens((1280, 720), 1.05, known)
 
 
