@@ -30,12 +30,9 @@ from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 160
-"""Number of entries that the nodes need with the default settings."""
-COMPLETE = "complete"
-"""Name of a file beside the entries: the digest of the sources for which all entries exist."""
-_OTHERS = 3
-"""Number of folders of other versions and processors that are kept."""
+LOOPS = 160  # number of entries that the nodes need with the default settings
+COMPLETE = "complete"  # name of a file beside the entries: the digest of the sources for which all entries exist
+_OTHERS = 3  # number of folders of other versions and processors that are kept
 _UNFINISHED = ".unfinished-"
 _MUCH = 5 * LOOPS
 """Number of unused entries above which they are removed."""
@@ -43,8 +40,7 @@ _WARNED = "STEADYPOSE_UNCACHED"
 """Environment variable that is set once a parent process has warned that nothing can be cached."""
 _DIGEST = hashlib.sha256().digest_size
 
-saved: set[str] = set()
-"""Names of the entries that this process has compiled and written."""
+saved: set[str] = set()  # names of the entries that this process has compiled and written
 watchers: list[Callable[[str], None]] = []
 """Functions that are called with the name of each entry when it is loaded or compiled."""
 

@@ -23,8 +23,7 @@ from steadypose.prior.body.skeleton import (
     finite_joints,
 )
 
-STATURE_SPREAD = 0.1
-"""Standard deviation of the logarithm of a person's size relative to the generic adult's."""
+STATURE_SPREAD = 0.1  # standard deviation of the logarithm of a person's size relative to the generic adult's
 
 LIMB_SPREAD, TRUNK_SPREAD = 0.05, 0.12
 """Standard deviations of the logarithm of a bone's length relative to the person's size. Motion capture of 22 people

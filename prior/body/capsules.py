@@ -16,11 +16,8 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import JOINTS, MIRROR, REST_OFFSETS, REST_POSITIONS, J
 
-REST_HEIGHT = 1.72
-"""Stature of a person with the bones `REST_OFFSETS`, metres."""
-
-TOE_HEIGHT = 0.015
-"""Height above the floor of the ball of a resting foot, metres."""
+REST_HEIGHT = 1.72  # stature of a person with the bones `REST_OFFSETS`, metres
+TOE_HEIGHT = 0.015  # height above the floor of the ball of a resting foot, metres
 
 CAPSULES: tuple[tuple[str, str, float], ...] = (
     ("pelvis", "spine3", 0.125),

@@ -49,8 +49,7 @@ RIGID = np.array(
     )
 )
 """(R, 2) the joints at the two ends of each rigid segment."""
-HELD = 1e-6
-"""Mobility of an observed joint in `fit_lengths`; an unobserved one has 1."""
+HELD = 1e-6  # mobility of an observed joint in `fit_lengths`; an unobserved one has 1
 _SWEEPS = 20
 
 # Points below which a hidden pelvis is placed upright, best first: each is the midpoint of two joints.

@@ -50,8 +50,7 @@ INTERPOLATED_SIGMA = 0.025
 """Standard deviation along an axis of a pelvis or neck that is interpolated, metres. The error of validation people's
 is 17 and 34 mm (mean distance)."""
 
-NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-"""Canonical joints that every layout must have."""
+NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")  # canonical joints that every layout must have
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ MIN_SPANS = 5
 BODY_ERROR = 0.5
 """Largest RMS of the logarithms of lengths relative to a human's at which joints form a body. Real trackers stay below
 0.35; joints read in the order of another layout exceed 0.55."""
-NO_LENGTH = 1e-4
-"""Least length relative to an adult's, which keeps logarithms finite if two joints coincide."""
+NO_LENGTH = 1e-4  # least length relative to an adult's, which keeps logarithms finite if two joints coincide
 
 HUMAN: Floats = np.linalg.norm(REST_POSITIONS[SPANS[:, 0]] - REST_POSITIONS[SPANS[:, 1]], axis=1)
 """(S,) lengths of an adult's spans, metres."""

@@ -13,8 +13,7 @@ import numpy as np
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import JOINTS, J
 
-COLLAR = (0.333, 0.278, 0.389)
-"""Shares of spine3, neck and shoulder in a collar, as in the rest pose."""
+COLLAR = (0.333, 0.278, 0.389)  # shares of spine3, neck and shoulder in a collar, as in the rest pose
 
 _MIXTURES: Mapping[str, Mapping[str, float]] = {
     "spine1": {"pelvis": 0.63, "spine3": 0.37},

@@ -62,8 +62,7 @@ _TURN_KEPT = math.exp(-1.0 / (TURN_MEMORY_S * FPS))
 CORRELATED = 60.0
 """Number of frames that count as one in the estimate of the usual direction, because noise and posture last, frames."""
 
-MAX_SIGMA = 0.5
-"""Standard deviation of an unknown joint, metres."""
+MAX_SIGMA = 0.5  # standard deviation of an unknown joint, metres
 _LEAST_LENGTH = 0.03  # least length of a bone, metres
 
 UNKNOWN_TWIST: Floats = np.tile([0.0, TWIST_RANGE**2], (LIMBS, 1))

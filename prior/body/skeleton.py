@@ -17,16 +17,14 @@ from steadypose.prior.arrays import Bools, Floats
 PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)
 """Parent of each canonical joint; -1 for the root."""
 
-PARENT: NDArray[np.intp] = np.array(PARENTS)
-"""(22,) parents, for compiled loops."""
+PARENT: NDArray[np.intp] = np.array(PARENTS)  # (22,) parents, for compiled loops
 
 CHILDREN: tuple[tuple[int, ...], ...] = tuple(
     tuple(child for child, parent in enumerate(PARENTS) if parent == joint) for joint in range(len(PARENTS))
 )
 """Children of each joint."""
 
-J: Mapping[str, int] = {name: i for i, name in enumerate(JOINTS)}
-"""Index of each canonical joint by name."""
+J: Mapping[str, int] = {name: i for i, name in enumerate(JOINTS)}  # index of each canonical joint by name
 
 
 def _bones_between() -> NDArray[np.int64]:
@@ -37,8 +35,7 @@ def _bones_between() -> NDArray[np.int64]:
     return between
 
 
-BONES_BETWEEN: NDArray[np.int64] = _bones_between()
-"""(22, 22) number of bones between two joints."""
+BONES_BETWEEN: NDArray[np.int64] = _bones_between()  # (22, 22) number of bones between two joints
 
 MIRROR: NDArray[np.intp] = np.array(
     [J[n.replace("left", "#").replace("right", "left").replace("#", "right")] for n in JOINTS]
@@ -87,8 +84,7 @@ def _rest_positions() -> Floats:
     return placed
 
 
-REST_POSITIONS: Floats = _rest_positions()
-"""(22, 3) positions relative to the pelvis in the rest pose, metres."""
+REST_POSITIONS: Floats = _rest_positions()  # (22, 3) positions relative to the pelvis in the rest pose, metres
 
 HIPS = (J["left_hip"], J["right_hip"])
 SHOULDERS = (J["left_shoulder"], J["right_shoulder"])

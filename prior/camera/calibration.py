@@ -26,14 +26,12 @@ from steadypose.prior.camera.gravity import level_pose
 
 Image = NDArray[np.uint8]
 
-MIN_CORNERS, MIN_VIEWS = 6, 8
-"""Least number of the board's corners in an image, and least number of such images."""
+MIN_CORNERS, MIN_VIEWS = 6, 8  # least number of the board's corners in an image, and least number of such images
 
 MIN_TILT = np.radians(20.0)
 """Least angle between the board's planes in two images, radians; parallel planes do not determine the focal length."""
 
-MAX_FOCAL_SIGMA = 0.01
-"""Largest relative standard deviation of a focal length that is accepted."""
+MAX_FOCAL_SIGMA = 0.01  # largest relative standard deviation of a focal length that is accepted
 
 OUTLIER_RATIO = 3.0
 """Ratio of an image's error to the median above which it is rejected, because the board was bent or moved."""
@@ -42,8 +40,7 @@ CORNER_SIGMA_PX, CORNER_SCALE_PX, CORNER_QUANTILE = 0.05, 0.3, 0.8
 """Standard deviation of a clearly visible corner, and scale of the robust loss, pixels; quantile of the corners'
 reprojection errors that decides whether a pose is accepted."""
 
-MAX_RMS_PX = 2.0
-"""Largest root mean square reprojection error of a result that is accepted, pixels."""
+MAX_RMS_PX = 2.0  # largest root mean square reprojection error of a result that is accepted, pixels
 
 FLOOR_SLACK, FLOOR_SHARE, FLOOR_TILT = 0.02, 0.1, np.radians(10.0)
 """Largest distance of an inlier from the floor, metres; least share of inliers; largest angle between the floor's

@@ -31,8 +31,7 @@ from steadypose.prior.arrays import Floats, Floats32
 from steadypose.prior.body.layouts import COCO17
 from steadypose.prior.compiled import njit
 
-MIN_CONFIDENCE = 0.3
-"""Least confidence of a key point; below it, detectors guess."""
+MIN_CONFIDENCE = 0.3  # least confidence of a key point; below it, detectors guess
 
 _K = {name: index for index, name in enumerate(COCO17.joints)}
 _JOINTS = len(COCO17.joints)
@@ -61,8 +60,7 @@ _FAR_LIMBS = np.array([0.05, 0.05, -0.03, -0.03])
 """Least distance of the far elbow, wrist, knee and ankle behind the midpoint of the hips, metres."""
 _TRUNK_REACH, _HEAD_REACH = 0.40, 0.50
 """Largest distances from the trunk's depth to a shoulder or hip, and from between the shoulders to the face, metres."""
-_ARM, _LEG = (0.45, 0.40), (0.60, 0.60)
-"""Largest accepted lengths of the bones of arm and leg, metres."""
+_ARM, _LEG = (0.45, 0.40), (0.60, 0.60)  # largest accepted lengths of the bones of arm and leg, metres
 _LIMBS = [
     ([_K[f"{side}_{joint}"] for joint in joints], lengths)
     for side in ("left", "right")

@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 from steadypose.msgs.types import Pose
 from steadypose.prior.arrays import Floats
 
-GRAVITY = 9.81
-"""Acceleration of gravity, m/s²."""
+GRAVITY = 9.81  # acceleration of gravity, m/s²
 MAX_DEVIATION = 0.7
 """Largest difference of a reading from gravity, m/s²; beyond it, the camera is being moved."""
-MEMORY_S = 1.0
-"""Time constant of the exponential average of readings, seconds."""
+MEMORY_S = 1.0  # time constant of the exponential average of readings, seconds
 UPDATE_ANGLE = np.radians(1.0)
 """Least change of direction that updates the pose, radians, so that the world does not shake with the noise."""
 

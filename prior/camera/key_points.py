@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 
-NEAREST, FARTHEST = 0.05, 100.0
-"""Range of distances of a point from the camera, metres."""
+NEAREST, FARTHEST = 0.05, 100.0  # range of distances of a point from the camera, metres
 
 
 @dataclass(frozen=True)

@@ -25,18 +25,13 @@ MATCH_RADIUS_M = 0.4
 """Largest distance between two cameras' observations of one body, median over the joints, metres."""
 CONFLICT_M = 0.25
 """Distance between two observations of a joint above which only the one with less variance is used, metres."""
-DEPTH_ERROR_RATIO = 2.0
-"""Ratio of the error along the line of sight to the error across it."""
-MAX_WAIT_NS = 100_000_000
-"""Longest time to wait for a camera before the others are merged without it, nanoseconds."""
-CAMERA_TIMEOUT_NS = 500_000_000
-"""Time without an image after which a camera is no longer awaited, nanoseconds."""
-MAX_GAP_NS = 150_000_000
-"""Longest gap between images of a camera that is interpolated, nanoseconds."""
+DEPTH_ERROR_RATIO = 2.0  # ratio of the error along the line of sight to the error across it
+MAX_WAIT_NS = 100_000_000  # longest time to wait for a camera before the others are merged without it, nanoseconds
+CAMERA_TIMEOUT_NS = 500_000_000  # time without an image after which a camera is no longer awaited, nanoseconds
+MAX_GAP_NS = 150_000_000  # longest gap between images of a camera that is interpolated, nanoseconds
 CLOCK_RESET_FRAMES = 30
 """Number of consecutive late images of all cameras after which the merged stream starts anew (clocks were set)."""
-MAX_BODIES = 16
-"""Largest number of a message's bodies that are merged; cameras observe fewer."""
+MAX_BODIES = 16  # largest number of a message's bodies that are merged; cameras observe fewer
 
 
 @dataclass(frozen=True)

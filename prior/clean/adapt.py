@@ -22,8 +22,7 @@ from steadypose.prior.compiled import median
 MIN_SIZE, MAX_SIZE, MIN_BONES = 0.05, 2.5, 4
 """Least and largest median ratio of a body's bone lengths to the mean person's; least number of observed bones to judge
 it. Some trackers give every joint the same position, often zero, in frames in which they fail."""
-UNIT_TOLERANCE = 0.01
-"""Largest deviation from 1 of the norm of a sensor's quaternion."""
+UNIT_TOLERANCE = 0.01  # largest deviation from 1 of the norm of a sensor's quaternion
 
 
 class BodyJoints(NamedTuple):

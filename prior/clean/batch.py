@@ -39,8 +39,7 @@ from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 PATIENCE_NS = 2 * PERIOD_NS
 """Longest time that a frame waits for the other streams, nanoseconds: one period for their different phases, and one
 for the network."""
-DRIFT = 200e-6
-"""Largest relative drift between two clocks, twice that of two poor quartz oscillators."""
+DRIFT = 200e-6  # largest relative drift between two clocks, twice that of two poor quartz oscillators
 LATE_IN_A_ROW = 15
 """Number of late frames in a row after which a stream starts anew (half a second). Its clock was set or its latency
 grew."""

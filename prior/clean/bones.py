@@ -33,29 +33,22 @@ MEMORY = round(3.0 * FPS)
 """Length of the running moments, and most frames that a mean counts for, frames. It is long compared with an error's
 correlation time of half a second, and short compared with a change of sensor."""
 
-PRIOR_FRAMES = round(0.5 * FPS)
-"""Weight of the expected bias as the prior, frames."""
+PRIOR_FRAMES = round(0.5 * FPS)  # weight of the expected bias as the prior, frames
 
 JITTER_RATIO = 4.0
 """Upper bound of the expected bias, as a multiple of the jitter, so that a noise-free sensor has none. For a Kinect v2,
 bones give a bias of 5.5 mm and third differences a jitter of 0.7 mm (medians of UI-PRMD, s01 to s06). The gate's
 estimate of the jitter is larger, because it includes part of the body's motion."""
 
-MIN_FRAMES = 3
-"""Number of frames after which a length's mean and variance are used."""
-
-UNKNOWN_VARIANCE = 1e-4
-"""Length variance of a segment observed for at most `MIN_FRAMES` frames, m²: (1 cm)²."""
-
-CORRELATION_FRAMES = 5.0
-"""Correlation time of the noise after smoothing, frames."""
+MIN_FRAMES = 3  # number of frames after which a length's mean and variance are used
+UNKNOWN_VARIANCE = 1e-4  # length variance of a segment observed for at most `MIN_FRAMES` frames, m²: (1 cm)²
+CORRELATION_FRAMES = 5.0  # correlation time of the noise after smoothing, frames
 
 OWN_LENGTH, GENERIC_LENGTH = 0.015, 0.025
 """Standard deviation of a sensor's bone length about the person's, and about a generic adult's until the person has
 been measured, metres. A sensor's joints are not exactly the skeleton's."""
 
-MAX_SIGMA = 0.05
-"""Largest standard deviation along an axis of a joint that counts for lengths, metres."""
+MAX_SIGMA = 0.05  # largest standard deviation along an axis of a joint that counts for lengths, metres
 
 _BONE = np.array([k for k, (end, start) in enumerate(RIGID) if start == PARENT[end]])
 

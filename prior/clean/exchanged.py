@@ -19,20 +19,11 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.timing.rate import FPS
 
-APART = 0.15
-"""Least mean distance of a limb's joints to their predictions to test for an exchange, metres."""
-
-BETTER = 0.4
-"""Share to which an exchange must reduce that distance."""
-
-LASTS = 4
-"""Number of frames from which on an exchange lasts: a limb is then exchanged as long as it is nearer so."""
-
-SIGMA = 0.03
-"""Standard deviation of joints along an axis, when postures are compared, metres."""
-
-FIRST = 15
-"""Largest number of a body's first frames that are tested, until one order is likelier by far."""
+APART = 0.15  # least mean distance of a limb's joints to their predictions to test for an exchange, metres
+BETTER = 0.4  # share to which an exchange must reduce that distance
+LASTS = 4  # number of frames from which on an exchange lasts: a limb is then exchanged as long as it is nearer so
+SIGMA = 0.03  # standard deviation of joints along an axis, when postures are compared, metres
+FIRST = 15  # largest number of a body's first frames that are tested, until one order is likelier by far
 
 RATIO, MARGIN = 1.25, 5.0
 """An order is likelier by far if the other's misfit exceeds this multiple of its own by this margin. Of 7,500 right
@@ -42,8 +33,7 @@ POSSIBLE = 60.0
 """Largest misfit of a likelier order. 95 % of right postures have at most 50 with 2 cm of noise; with 4 cm, and 12 cm
 along a camera's ray, half have more than 90, and chance decides between orders."""
 
-MEMORY = 9
-"""Length of the running mean of misfits, frames."""
+MEMORY = 9  # length of the running mean of misfits, frames
 
 _CHAINS = ("elbow", "wrist"), ("knee", "ankle", "foot")
 _LIMBS = tuple(np.concatenate(limbs(chain)) for chain in _CHAINS)

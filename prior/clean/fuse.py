@@ -35,8 +35,7 @@ _NEAR = 1 / (1 + BONES_BETWEEN) ** 2
 _CHEST, _PAIRS = J["spine3"], ((J["left_hip"], J["right_hip"]), (J["left_collar"], J["right_collar"]))
 _TRUNK = np.isin(JOINTS, ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar"))
 
-_MIN_VARIANCE = 1e-10
-"""Least variance of a position, m²: a hundredth of a millimetre squared."""
+_MIN_VARIANCE = 1e-10  # least variance of a position, m²: a hundredth of a millimetre squared
 
 
 class Precision(NamedTuple):

@@ -18,8 +18,7 @@ from steadypose.prior.body.skeleton import TRUNK_LANDMARKS, J, finite_joints
 from steadypose.prior.clean.settings import RECENT_S, IdentifySettings
 from steadypose.prior.timing.kalman import ConstantVelocityFilter
 
-ACCELERATION = 1.0
-"""Spectral density of a visible body's white acceleration noise, m²/s³."""
+ACCELERATION = 1.0  # spectral density of a visible body's white acceleration noise, m²/s³
 SPEED, SPEED_MEMORY_S = 0.6, 1.0
 """Standard deviation and correlation time of the velocity of a body out of sight, m/s and seconds. The velocity is an
 Ornstein-Uhlenbeck process, so a person who stops behind a pillar is not predicted into the next room."""
@@ -30,22 +29,16 @@ NEWCOMERS = 0.01
 """Density of new people relative to one person who reappears, 1/m³ (a tenth of a person in a room of 20 m²)."""
 LENGTH_SIGMA, LENGTH_MEMORY_S = 0.05, 1.0
 """Standard deviation (metres) and correlation time (seconds) of the error of an observed bone length."""
-LENGTH_SPREAD = 0.1
-"""Standard deviation of a bone's length between people, relative to its length."""
+LENGTH_SPREAD = 0.1  # standard deviation of a bone's length between people, relative to its length
 LENGTH_DOUBT = 3.0
 """Largest amount by which one bone can lower the log-likelihood ratio, so that an outlier does not decide."""
 CERTAIN_SCORE = 3.0
 """Margin of the best score over all others at which a body is recognised without waiting for `birth` (odds of 20 to
 1)."""
-APART = 0.25
-"""Distance below which two bodies are one person detected twice, metres."""
-MIN_CONFIDENCE = 0.3
-"""Least confidence of a bone's joints for its length to count."""
-MIN_JOINTS = 6
-"""Least number of visible joints of a detection."""
-
-_FREE, _TENTATIVE = 0, -1
-"""Values in place of an id; ids start at 1."""
+APART = 0.25  # distance below which two bodies are one person detected twice, metres
+MIN_CONFIDENCE = 0.3  # least confidence of a bone's joints for its length to count
+MIN_JOINTS = 6  # least number of visible joints of a detection
+_FREE, _TENTATIVE = 0, -1  # values in place of an id; ids start at 1
 
 _BONES: tuple[tuple[tuple[str, str], ...], ...] = (
     (("left_hip", "left_knee"), ("right_hip", "right_knee")),
@@ -212,8 +205,7 @@ _MIN_STEP_S = 1e-3
 
 _ENDS = np.array([[[J[end] for end in bone] for bone in (sides[0], sides[-1])] for sides in _BONES])
 """(B, 2, 2) the joints at the two ends of each bone, on both sides of the body."""
-_GENERIC_LENGTHS = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])
-"""(B,) metres, bone lengths of the generic adult."""
+_GENERIC_LENGTHS = np.array([0.415, 0.41, 0.275, 0.25, 0.36, 0.50])  # (B,) metres, bone lengths of the generic adult
 
 
 def _bone_lengths(bodies: Floats, confidence: Floats) -> Floats:

@@ -15,16 +15,14 @@ from steadypose.prior.clean.frame import BodyWindows, Imputed
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.hgvae.features import Tracks, from_tracks
 
-CARRY_FRAMES = 20.0
-"""Decay length (1/e) inside a gap of the model's residual at the edge of the gap, frames."""
+CARRY_FRAMES = 20.0  # decay length (1/e) inside a gap of the model's residual at the edge of the gap, frames
 
 EDGE_FRAMES = 3
 EDGE_NOISE = 0.005
 """Number of frames over which the residual at the edge of a gap is averaged, and jitter above which it is, metres. The
 mean keeps one frame's noise out of the gap. With less jitter, the residual of the last frame is used."""
 
-SIGMA_SCALE = 1.2
-"""Error-to-sigma ratio of HG-VAE for limbs hidden for 0.3 to 2 s in validation motion."""
+SIGMA_SCALE = 1.2  # error-to-sigma ratio of HG-VAE for limbs hidden for 0.3 to 2 s in validation motion
 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:

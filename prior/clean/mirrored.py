@@ -25,8 +25,7 @@ mean square so far (chosen on validation, benchmarks/NOTEBOOK.md)."""
 MOVED = 0.03
 """Least such distance of two joints at an onset, metres. If a single joint is far, it has jumped."""
 
-BETTER = 0.5
-"""Share to which mirroring must reduce the limb's distance to its prediction."""
+BETTER = 0.5  # share to which mirroring must reduce the limb's distance to its prediction
 
 MEMORY, FIRST = 20, 10
 """Length of the running mean square of that distance, and number of frames before a limb is judged."""

@@ -57,14 +57,9 @@ are unknown too, the Gaussian brings nothing."""
 DENSITIES = np.array([0.05, 0.3, 1.8, 10.0, 60.0])
 """Spectral densities of the acceleration noise of the filters that bridge a gap, m²/s³."""
 
-BEFORE = 14
-"""Largest number of frames before the gap that are used."""
-
-MIN_NOISE = 1e-3
-"""Least standard deviation of the measurements along an axis, metres."""
-
-FIRST_SPEED = 3.0
-"""Standard deviation of the velocity along an axis before it is measured, m/s."""
+BEFORE = 14  # largest number of frames before the gap that are used
+MIN_NOISE = 1e-3  # least standard deviation of the measurements along an axis, metres
+FIRST_SPEED = 3.0  # standard deviation of the velocity along an axis before it is measured, m/s
 
 
 class Placed(NamedTuple):

@@ -22,8 +22,7 @@ MIN_SHARE, MIN_DIFFERENCE, DEVIATIONS = 0.5, 0.1, 6.0
 """Thresholds of an impossible length: its difference from the mean exceeds this share of the mean, this many metres and
 this many standard deviations (chosen on validation, benchmarks/NOTEBOOK.md)."""
 
-MIN_DEVIATION = 0.01
-"""Least standard deviation of a length, metres."""
+MIN_DEVIATION = 0.01  # least standard deviation of a length, metres
 
 MEMORY, FIRST = 45, 15
 """Length of the running mean and deviation, and number of observations before a bone is judged, frames."""
@@ -32,8 +31,7 @@ WINSORISED = 2.0
 """Bound at which differences are clipped before they update mean and deviation, standard deviations. A single outlier
 then has little effect, but a lasting new length is accepted within two seconds."""
 
-INTACT_DEVIATIONS, INTACT = 2.0, 0.01
-"""Largest change of length of an intact bone, standard deviations or metres."""
+INTACT_DEVIATIONS, INTACT = 2.0, 0.01  # largest change of length of an intact bone, standard deviations or metres
 
 TELLING = 0.03
 """Largest standard deviation of a bone that can tell a jump from motion, as a share of the joint's prediction error."""
@@ -41,11 +39,8 @@ TELLING = 0.03
 MAX_OUTLIERS = 0.5
 """Share of impossible bones among the limbs' observed bones above which it is another body, measured anew."""
 
-RECENT = 15
-"""Number of recent frames in most of which a frozen joint must repeat itself."""
-
-SAME = 1e-6
-"""Largest motion between two frames of a joint that repeats itself, metres."""
+RECENT = 15  # number of recent frames in most of which a frozen joint must repeat itself
+SAME = 1e-6  # largest motion between two frames of a joint that repeats itself, metres
 
 MIN_NOISE = 0.001
 """Least noise along an axis, from frame to frame, for frozen joints to be detected, metres. With a quieter sensor, a
@@ -55,8 +50,7 @@ MAX_ALIKE = 0.1
 """Largest share of repeated coordinates among joints that moved. Above it the sensor rounds its output, and any joint
 at rest repeats itself."""
 
-_MIN_NEW = 5
-"""Least number of frames that do not repeat the whole body."""
+_MIN_NEW = 5  # least number of frames that do not repeat the whole body
 
 _LIMB_JOINTS = np.sort(np.concatenate(limbs(("shoulder", "elbow", "wrist"), ("knee", "ankle", "foot"))))
 _IN_LIMB = np.isin(np.arange(len(PARENT)), _LIMB_JOINTS)

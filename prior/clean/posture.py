@@ -32,11 +32,8 @@ SHARE = 0.7
 LITTLE = 0.003
 """Standard deviation along an axis at which the share is halved, metres: people's joints differ from the skeleton's."""
 
-AT_MOST = 1.5
-"""Largest standard deviation of an observed joint in white noise, relative to the noise."""
-
-UNKNOWN_VARIANCE = 1e6
-"""Largest variance of a joint along an axis that a mean's counts, m²."""
+AT_MOST = 1.5  # largest standard deviation of an observed joint in white noise, relative to the noise
+UNKNOWN_VARIANCE = 1e6  # largest variance of a joint along an axis that a mean's counts, m²
 
 
 class Posture:

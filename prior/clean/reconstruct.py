@@ -23,8 +23,7 @@ from steadypose.prior.models.hgvae.inference import LiveHGVAE
 from steadypose.prior.timing.kalman import Smoothed
 from steadypose.prior.timing.rate import FPS
 
-MIN_CONFIDENCE = 0.1
-"""Least confidence assigned to a joint that passed the gate."""
+MIN_CONFIDENCE = 0.1  # least confidence assigned to a joint that passed the gate
 
 MODEL_SIGMA = 0.005
 """Least standard deviation along an axis of HG-VAE's own error, excluding the sensor's noise, metres."""
@@ -42,8 +41,7 @@ LATE_S, LATE_NEWEST_S = 0.01, 0.03
 """Lag of HG-VAE behind a moving joint, seconds: at least `SETTLED` frames before the newest frame, and in the newest.
 At 3 m/s this is 3 or 9 cm. When a motion begins, the running mean does not include it yet."""
 
-SETTLED = 4
-"""Distance from the newest frame at which a frame of the window has settled, frames."""
+SETTLED = 4  # distance from the newest frame at which a frame of the window has settled, frames
 
 RENEWAL = 0.5
 """Weight of the newest window in the running mean of a frame's reconstructions. Successive windows disagree, and

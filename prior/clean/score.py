@@ -34,8 +34,7 @@ MAX_SCALE = 2.0
 OWN_FRAMES, FIRST_FRAMES = 300, 30
 """Length of the running mean, and weight of `MEAN_ANOMALY` in it for a new body, frames."""
 
-RELEASED = 0.8
-"""Fraction of the flag's threshold below which the anomaly must stay for the flag to be cleared."""
+RELEASED = 0.8  # fraction of the flag's threshold below which the anomaly must stay for the flag to be cleared
 
 
 class OwnScale:

@@ -27,11 +27,8 @@ from steadypose.prior.models.sensor_bias import HISTORY, SMOOTHER_DENSITY, LiveC
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
 
-FADE = 0.9
-"""Decay per frame of the last correction while none can be computed, because the trunk is hidden."""
-
-MEMORY = round(10.0 * FPS)
-"""Length of the running means of bone lengths, frames."""
+FADE = 0.9  # decay per frame of the last correction while none can be computed, because the trunk is hidden
+MEMORY = round(10.0 * FPS)  # length of the running means of bone lengths, frames
 
 PRIOR, RIDGE = 8.0, 0.05
 """Weight of the isotropic prior: frames, and share of all frames. A standing body's bones have few directions."""

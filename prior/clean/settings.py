@@ -8,8 +8,7 @@ from typing import Any
 
 from steadypose.prior.settings import build_settings, check_range, current_keys, weights_setting
 
-MAX_DELAY = 16
-"""Longest delay that the mixture of smoothers is trained for, frames."""
+MAX_DELAY = 16  # longest delay that the mixture of smoothers is trained for, frames
 
 RECENT_S = 0.25
 """Longest time without an observation after which `identify` matches a body by position alone, seconds. Later, bone

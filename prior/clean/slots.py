@@ -12,8 +12,7 @@ from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.adapt import BodyJoints
 
-MIN_JOINTS = 6
-"""Least number of observed canonical joints of a new body."""
+MIN_JOINTS = 6  # least number of observed canonical joints of a new body
 ABSENT_NS = 200_000_000
 """Time without an observation after which a body makes way for a new one if no slot is free, nanoseconds. A detector
 misses people for less, and a client's frame may come that late."""

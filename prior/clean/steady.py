@@ -36,11 +36,8 @@ LOOK_AHEAD = 3
 """Least delay at which joints are moved to the middle, frames. With less, the next frame's estimate is too uncertain:
 at 2, what changes of a Kinect's error is 0.8 % larger (validation)."""
 
-MEMORY_S = 0.5
-"""Time constant of that mean distance, seconds."""
-
-TINY = 1e-12
-"""Least divisor of a move, metres."""
+MEMORY_S = 0.5  # time constant of that mean distance, seconds
+TINY = 1e-12  # least divisor of a move, metres
 
 
 class Steady:

@@ -25,14 +25,9 @@ from steadypose.prior.models.mixture.inference import MixtureSmoother
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.timing.rate import FPS
 
-LONGEST_GAP = 64
-"""Longest gap on which the completer is trained, frames."""
-
-AROUND = 7
-"""Context of a window on each side of a gap, if the recording has it, frames."""
-
-LONGEST = LONGEST_GAP + 2 * AROUND
-"""Longest window, frames."""
+LONGEST_GAP = 64  # longest gap on which the completer is trained, frames
+AROUND = 7  # context of a window on each side of a gap, if the recording has it, frames
+LONGEST = LONGEST_GAP + 2 * AROUND  # longest window, frames
 
 _HOP = 32
 
@@ -116,11 +111,8 @@ def views(known: Bools) -> list[View]:
     return found
 
 
-MIN_SIGMA = 0.002
-"""Least standard deviation of a given joint along an axis, metres."""
-
-MIN_NEVER = 0.015
-"""Least standard deviation along an axis of a joint that was never given, metres."""
+MIN_SIGMA = 0.002  # least standard deviation of a given joint along an axis, metres
+MIN_NEVER = 0.015  # least standard deviation along an axis of a joint that was never given, metres
 
 _WAIST, UNSEEN_WAIST = [J["pelvis"], *HIPS], 0.12
 """Least standard deviation along an axis of pelvis and hips if nothing from the hips down was ever given, metres
@@ -183,8 +175,7 @@ Fill = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """Type of a completer of whole windows, such as `LiveCompleter`. It maps positions (B, T, 22, 3), NaN where unknown,
 and bones (B, 22, 3) to local rotations (B, T, 22, 3, 3) and root positions (B, T, 3), metres."""
 
-BENT = 0.02
-"""Distance of a known joint from its bones above which the unknown joints above are solved again, metres."""
+BENT = 0.02  # distance of a known joint from its bones above which the unknown joints above are solved again, metres
 
 
 @dataclass(frozen=True)

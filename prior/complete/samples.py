@@ -25,11 +25,8 @@ real ones do."""
 CHANGE = 3.0
 """The same of the process given what is known, frames; joints appear and disappear from one frame to the next."""
 
-EASE = 8.0
-"""Time in which an alternative parts from a joint's last observation, frames."""
-
-KNOWN_SIGMA = 0.02
-"""Standard deviation along an axis of a known joint's difference from a posture, metres of an adult."""
+EASE = 8.0  # time in which an alternative parts from a joint's last observation, frames
+KNOWN_SIGMA = 0.02  # standard deviation along an axis of a known joint's difference from a posture, metres of an adult
 
 
 def draw(

@@ -99,8 +99,7 @@ SPEED_NS = 100_000_000
 """Interval over which speeds are measured, nanoseconds; a centimetre of jitter then counts as 0.1 m/s."""
 UPRIGHT = 0.5
 """Least height of the neck above the pelvis of a sitting body, trunk lengths: 30 degrees above the horizontal."""
-CERTAIN = 1e-6
-"""Standard deviation of quantities that are not computed from joints."""
+CERTAIN = 1e-6  # standard deviation of quantities that are not computed from joints
 
 
 class EventDetector:

@@ -27,8 +27,7 @@ HIPS, SHOULDERS = (
 )
 """Distances between the hip and shoulder joints of an adult, metres."""
 
-NARROW = 0.05
-"""Least horizontal width of hips and shoulders together at which a body's heading is defined, metres."""
+NARROW = 0.05  # least horizontal width of hips and shoulders together at which a body's heading is defined, metres
 
 ANKLE, LEG_SIGMA, TRUNK_SIGMA = 0.07, 0.05, 0.05
 """Height of a standing adult's ankle over the floor, and standard deviations of an unobserved leg's length and of

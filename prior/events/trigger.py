@@ -71,8 +71,7 @@ raised to the side and lowered also starts like this."""
 OUT = 0.45
 """Least size of a wave's first swing, as a fraction of the others': it begins in the middle, and smoothing takes the
 most from it."""
-CENTRED = 0.45
-"""Largest mean angle from upright of two swings about upright, radians."""
+CENTRED = 0.45  # largest mean angle from upright of two swings about upright, radians
 SPEED, SPEED_NS = 1.0, 140_000_000
 """Least speed of the forearm when a swing counts, radians per second, and the time over which it is measured,
 nanoseconds. A raised hand that drifts is slower, as is a joint that jumped while it was hidden and came to rest."""

@@ -31,8 +31,7 @@ from steadypose.prior.fit.humor_state import (
 )
 from steadypose.prior.fit.tensors import from_6d
 
-GROUPS = 16
-"""Number of groups of the group normalisation."""
+GROUPS = 16  # number of groups of the group normalisation
 
 STEP_SCALE = 0.02
 """Unit of the decoder's output, metres and radians: about the standard deviation of the change in one frame."""

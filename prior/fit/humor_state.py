@@ -21,8 +21,7 @@ JOINT_COUNT = len(PARENTS)
 FEATURES = 3 + 6 * JOINT_COUNT + 3 * (JOINT_COUNT - 1) + 3 * JOINT_COUNT + 3
 """Number of features of a state: root, 6D rotations, root-relative joints, velocities, and the root's turning."""
 
-CHANGE = 3 + 3 * JOINT_COUNT
-"""Number of values of a step: displacement of the root, and rotation vectors of all joints."""
+CHANGE = 3 + 3 * JOINT_COUNT  # number of values of a step: displacement of the root, and rotation vectors of all joints
 
 _MIN_LEVEL = 1e-4
 """Least horizontal component of the body's left axis; a body that lies exactly on its side has no heading."""

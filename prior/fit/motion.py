@@ -26,8 +26,7 @@ SCALES: Mapping[str, float] = {
 }  # fmt: skip
 """Sizes of an optimiser step of 1, metres, radians and standard deviations."""
 
-MAX_LATENT = 3.0
-"""Largest distance of an initial latent from the prior's mean, standard deviations of the prior."""
+MAX_LATENT = 3.0  # largest distance of an initial latent from the prior's mean, standard deviations of the prior
 
 
 def float_tensor(values: NDArray[np.floating]) -> Tensor:

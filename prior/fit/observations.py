@@ -15,14 +15,12 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.fit.energy import Term, bisquare, geman_mcclure, huber
 from steadypose.prior.fit.motion import Motion
 
-ROBUST = 5.0
-"""Residual above which a key point or a point of the surface is an outlier, standard deviations."""
+ROBUST = 5.0  # residual above which a key point or a point of the surface is an outlier, standard deviations
 
 CLEAR = 3.0
 """Residual above which the pull of a 3D joint is constant, standard deviations. No joint is ignored altogether."""
 
-MOST_POINTS = 200
-"""Largest number of surface points per frame that are fitted."""
+MOST_POINTS = 200  # largest number of surface points per frame that are fitted
 
 POINT_SHARE = 0.03
 """Weight of a surface point if there are 3D joints. The errors of capsules and of a depth camera last, so that many

@@ -26,22 +26,16 @@ from steadypose.prior.models.completer_features import rotations_of_6d, solved_r
 from steadypose.prior.models.hmvae import HMVAEConfig
 from steadypose.prior.models.line import anchored, draw_line
 
-MODEL = "hmvae64"
-"""Name of the model's weights."""
+MODEL = "hmvae64"  # name of the model's weights
 
 LATENT_STEPS, LATENT_RATE, RANDOM_RATE = 50, 0.01, 0.1
 DECODER_STEPS, DECODER_RATE = 100, 1e-4
 """Steps and learning rates of Adam, in the first phase over the latents and in the second over the decoder too. The
 official rate of the latents suits random ones; it moves the completer's latents too far (benchmarks/NOTEBOOK.md)."""
 
-JOINT_WEIGHT = 10.0
-"""Weight lambda_1 of equation 14."""
-
-STAY_WEIGHT = 1000.0
-"""Weight lambda_2 of equation 15, of the mean squared change of each of the decoder's tensors."""
-
-AGREE_WEIGHT = 1.0
-"""Weight of the mean squared difference between overlapping windows."""
+JOINT_WEIGHT = 10.0  # weight lambda_1 of equation 14
+STAY_WEIGHT = 1000.0  # weight lambda_2 of equation 15, of the mean squared change of each of the decoder's tensors
+AGREE_WEIGHT = 1.0  # weight of the mean squared difference between overlapping windows
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,7 @@ _REACH, _NEAREST = 0.08, 5
 """Largest distance in the image between a key point and points that give its depth, metres; number of such points."""
 _FLESH = np.array([max((r for a, b, r in CAPSULES if name in (a, b)), default=0.1) for name in JOINTS])
 """Distance from the skin to each joint, metres."""
-_SIZES = 0.6, 1.25
-"""Least and largest size from the floor, relative to the initial bones."""
+_SIZES = 0.6, 1.25  # least and largest size from the floor, relative to the initial bones
 _ANKLES_TOES = [(J[f"{side}_ankle"], J[f"{side}_foot"]) for side in ("left", "right")]
 _FEET = np.array(CONTACT_JOINTS[2:6])
 _AHEAD, _STRIDE, _STANDS = 0.2, 15, 30.0
@@ -191,14 +190,12 @@ def _interpolated(values: Floats) -> Floats:
 Clean = Callable[[Floats], Floats]
 """Type of `steadypose clean` as a function: joints (T, 22, 3) metres, world, at 30 Hz; NaN without a body."""
 
-PIXEL_SIGMA = 0.01
-"""Standard deviation of a key point in the image, focal lengths."""
+PIXEL_SIGMA = 0.01  # standard deviation of a key point in the image, focal lengths
 
 CAMERA_HEIGHT, CAMERA_HEIGHT_SIGMA = 1.3, 0.3
 """Assumed height of a camera above the floor if it is unknown, and its standard deviation, metres."""
 
-LIFTED_SIGMA = 0.08
-"""Standard deviation along an axis of key points with the depth of the surface around them, metres."""
+LIFTED_SIGMA = 0.08  # standard deviation along an axis of key points with the depth of the surface around them, metres
 
 
 def track_of_picture(

@@ -27,17 +27,13 @@ from steadypose.prior.timing.rate import FPS
 
 POSES = ("root", "orientation", "turns")
 
-ROUND = 10
-"""Number of L-BFGS steps between two convergence checks."""
+ROUND = 10  # number of L-BFGS steps between two convergence checks
 
 STIFFNESS = 30.0
 """Ratio of the curvatures of the motion terms and of the observations: about the square of 4 cm over 7 mm."""
 
-TOLERANCE = 1e-4
-"""Relative decrease of the energy below which a round is the last."""
-
-WINDOW = 7
-"""Number of frames of which a joint's initial acceleration is the median."""
+TOLERANCE = 1e-4  # relative decrease of the energy below which a round is the last
+WINDOW = 7  # number of frames of which a joint's initial acceleration is the median
 
 DISCREPANCY, NEGLIGIBLE = 1.08, 0.1
 """Stage 3 is kept if the energy of the observations is at most this many times that of stage 2, or at most this share

@@ -22,14 +22,9 @@ from steadypose.prior.fit.motion import Motion
 from steadypose.prior.fit.observations import Observed
 from steadypose.prior.fit.solve import FitSettings, Fitted, Start, fit_window
 
-FRAMES, OVERLAP = 90, 15
-"""Length of a window, as in the paper, and overlap with the next window, frames."""
-
-LYING = 0.5
-"""Cosine of the pelvis' tilt below which a body lies."""
-
-MIN_FRAMES = 8
-"""Length of the shortest track that is fitted, frames."""
+FRAMES, OVERLAP = 90, 15  # length of a window, as in the paper, and overlap with the next window, frames
+LYING = 0.5  # cosine of the pelvis' tilt below which a body lies
+MIN_FRAMES = 8  # length of the shortest track that is fitted, frames
 
 
 @dataclass(frozen=True)

@@ -281,5 +281,4 @@ _READERS: Mapping[str, Callable[[bytes, Description], _Read]] = {
     ".bvh": _bvh, ".trc": _trc, ".c3d": _c3d, ".npy": _array, ".npz": _amass,
 }  # fmt: skip
 
-SUFFIXES = tuple(_READERS)
-"""Suffixes of motion files."""
+SUFFIXES = tuple(_READERS)  # suffixes of motion files

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from steadypose.prior.body.skeleton import JOINTS
 
-MARKER_RADIUS = 0.007
-"""Distance from the skin to a marker's centre, metres (14 mm markers)."""
+MARKER_RADIUS = 0.007  # distance from the skin to a marker's centre, metres (14 mm markers)
 
 KNEE_WIDTH, ANKLE_WIDTH, ELBOW_WIDTH = 0.105, 0.072, 0.072
 """Widths of joints, adult means, metres. Plug-in-Gait expects measured widths, which the recordings lack."""
@@ -37,16 +36,14 @@ KNEE_WIDTH, ANKLE_WIDTH, ELBOW_WIDTH = 0.105, 0.072, 0.072
 TOE_DEPTH = 0.02
 """Distance from the toe marker down to the forefoot's joint, metres (marker radius and half the foot's thickness)."""
 
-BAND_TO_EARS = 0.08
-"""Distance from the band with the head's markers down to the height of the ears, metres."""
+BAND_TO_EARS = 0.08  # distance from the band with the head's markers down to the height of the ears, metres
 
 MAX_PELVIS_WIDTH, MAX_PELVIS_DEPTH = 0.30, 0.22
 """Largest width and depth of the pelvis in the regression, metres. Soft tissue displaces the front markers of heavy
 subjects outwards and forwards (46 by 27 cm for one subject); the regression, fitted to lean subjects, would then place
 the hips 32 cm apart."""
 
-MIN_BEND = 0.3
-"""Sine of the bend below which a limb is too straight to show its axis of bending."""
+MIN_BEND = 0.3  # sine of the bend below which a limb is too straight to show its axis of bending
 
 MIN_BEND_WEIGHT = 20.0
 """Least sum of sin(bend) over frames for a subject's functional axis; with less, the wand's direction is used."""

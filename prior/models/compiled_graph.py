@@ -26,8 +26,7 @@ _LINEAR, _GELU, _NORM, _ATTEND = range(4)
 _FIELDS = 8
 _NONE = -1
 
-_NORM_EPSILON = np.float32(1e-5)
-"""Variance added in a layer normalisation, torch's default."""
+_NORM_EPSILON = np.float32(1e-5)  # variance added in a layer normalisation, torch's default
 
 
 class Program:

@@ -38,16 +38,14 @@ OUTPUTS = JOINTS * 6 + 3 + JOINTS + 1
 """Number of outputs of a frame: corrections of each joint's 6D rotation and of the root's position (metres), and logits
 of the gates of each joint's and the root's bend."""
 
-NEAR = 8.0
-"""Distance from a known frame at which the nearness 1 / (1 + d / NEAR) is one half, frames."""
+NEAR = 8.0  # distance from a known frame at which the nearness 1 / (1 + d / NEAR) is one half, frames
 
 SHARE_FRAMES = 75.0
 """Length of a gap, frames, at which the whole correction is applied; in shorter gaps, a share proportional to their
 length. Among curves compared on validation people, by source, it is the simplest that is at no gap much worse than the
 cubic or the line (benchmarks/NOTEBOOK.md)."""
 
-MAX_BEND = 2.0
-"""Bound of the root's bend along an axis, metres."""
+MAX_BEND = 2.0  # bound of the root's bend along an axis, metres
 
 _FASTEST = 10.0  # m/s
 _SPINE = [J["spine1"], J["spine2"]]

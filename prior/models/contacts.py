@@ -17,17 +17,10 @@ OF_JOINT = 12
 """Number of features of a joint: position (3) and velocity (3) relative to the root, height, velocity (3), standard
 deviation, known flag."""
 
-OF_BODY = 2
-"""Number of features of a body: whether the root is observed, and whether the ground is known."""
-
-FEATURES = OF_JOINT * len(CONTACT_JOINTS) + OF_BODY
-"""Number of features of a frame."""
-
-FROM_ROOT, FASTEST = 0.5, 3.0
-"""Unit of positions, metres, and unit and clipping bound of velocities, m/s."""
-
-HEIGHT, HIGHEST = 0.1, 0.6
-"""Unit and clipping bound of heights, metres."""
+OF_BODY = 2  # number of features of a body: whether the root is observed, and whether the ground is known
+FEATURES = OF_JOINT * len(CONTACT_JOINTS) + OF_BODY  # number of features of a frame
+FROM_ROOT, FASTEST = 0.5, 3.0  # unit of positions, metres, and unit and clipping bound of velocities, m/s
+HEIGHT, HIGHEST = 0.1, 0.6  # unit and clipping bound of heights, metres
 
 SIGMA, MIN_SIGMA, MAX_SIGMA = 0.01, 1e-3, 1.0
 """Unit and range of standard deviations, which enter by their logarithm, metres."""

@@ -20,17 +20,13 @@ from steadypose.prior.models.completer_features import rotations_of_6d
 from steadypose.prior.models.layers import Dense, leaky_relu, mix_edges, pool_matrix, pooling_levels, unpool_matrix
 from steadypose.prior.models.weights import Arrays, load_weights, part
 
-ROTATION_FEATURES = 6
-"""Number of features of a joint: the first two columns of its local rotation."""
+ROTATION_FEATURES = 6  # number of features of a joint: the first two columns of its local rotation
 
 CHANNELS = (ROTATION_FEATURES, 12, 24, 48, 96)
 """Channels of an edge, before the encoder's first block and after each block."""
 
-DEVIATION = 0.1
-"""Unit of a joint's deviations from its mean over a window: their typical size."""
-
-NO_ROTATION = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-"""Features of a joint that does not deviate from its mean."""
+DEVIATION = 0.1  # unit of a joint's deviations from its mean over a window: their typical size
+NO_ROTATION = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)  # features of a joint that does not deviate from its mean
 _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 
 

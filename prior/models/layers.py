@@ -15,8 +15,7 @@ from steadypose.prior.arrays import Floats32
 from steadypose.prior.models.matmul import multiply_packed, packed
 from steadypose.prior.models.weights import Arrays
 
-SLOPE = 0.2
-"""Slope of the LeakyReLU for negative values."""
+SLOPE = 0.2  # slope of the LeakyReLU for negative values
 
 BLOCKS, NEAR = 4, 2
 """Number of HM-VAE's blocks, and distance within which edges are mixed by a convolution over the skeleton, edges."""

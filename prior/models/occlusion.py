@@ -24,20 +24,12 @@ from steadypose.prior.timing.rate import FPS
 CANDIDATES = 4
 """Number of candidates: coasting, completed, held in the body frame, and bridged (coasting if not observed again)."""
 
-FEATURES = 25
-"""Number of features of an occluded joint."""
-
-MIN_DISTANCE = 1e-3
-"""Offset added to distances before their logarithm is taken, metres."""
-MIN_SIGMA = 1e-4
-"""Offset added to standard deviations before their logarithm is taken, metres."""
-MIN_SPEED = 0.02
-"""Offset added to speeds before their logarithm is taken, m/s."""
-MIN_HEIGHT = 0.01
-"""Offset added to heights above the lowest joint before their logarithm is taken, metres."""
-
-FADING = 0.4
-"""Weight of the newest speed in its running mean."""
+FEATURES = 25  # number of features of an occluded joint
+MIN_DISTANCE = 1e-3  # offset added to distances before their logarithm is taken, metres
+MIN_SIGMA = 1e-4  # offset added to standard deviations before their logarithm is taken, metres
+MIN_SPEED = 0.02  # offset added to speeds before their logarithm is taken, m/s
+MIN_HEIGHT = 0.01  # offset added to heights above the lowest joint before their logarithm is taken, metres
+FADING = 0.4  # weight of the newest speed in its running mean
 
 AVERAGING = 0.1
 """Weight of the newest completion in the running mean of the position of a joint that was never observed. For legs, it

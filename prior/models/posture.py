@@ -38,8 +38,7 @@ UNLIKE = 0.01
 MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
 """Bounds of a joint's standard deviation, metres; an unknown joint has the upper bound."""
 
-LENGTH_SIGMA = 0.01
-"""Assumed standard deviation of a person's bone lengths, metres."""
+LENGTH_SIGMA = 0.01  # assumed standard deviation of a person's bone lengths, metres
 _ROUNDS = 2
 
 LEAST_SIGMA = math.radians(0.5)
@@ -51,8 +50,7 @@ WITHIN = np.radians((1.5, 4.0, 5.0))
 DEPENDENT = 1.7
 """Factor on the covariance of the averaged root, because the two estimates share most noise (validation people)."""
 
-MIN_SIZE = 0.05
-"""Least size of a body whose postures are compared, relative to an adult's: joints may coincide."""
+MIN_SIZE = 0.05  # least size of a body whose postures are compared, relative to an adult's: joints may coincide
 
 _CORNERS = (*HIPS, *SHOULDERS)
 _REST_SIZE = float(REST_LENGTHS.sum())

@@ -17,14 +17,9 @@ from steadypose.prior.models.layers import LiveRecurrent
 from steadypose.prior.models.weights import Arrays, load_weights
 from steadypose.prior.timing.rate import FPS
 
-FRAME_S = 1.0 / FPS
-"""Time between the network's frames, seconds."""
-
-FEATURES = 22 * 6
-"""Number of features of a frame: each joint's position and velocity relative to the root."""
-
-FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0
-"""Unit of positions, metres, and unit and clipping bound of velocities, m/s."""
+FRAME_S = 1.0 / FPS  # time between the network's frames, seconds
+FEATURES = 22 * 6  # number of features of a frame: each joint's position and velocity relative to the root
+FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0  # unit of positions, metres, and unit and clipping bound of velocities, m/s
 
 
 @dataclass(frozen=True)

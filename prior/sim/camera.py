@@ -31,8 +31,7 @@ from steadypose.prior.sim.noise import (
     travelled,
 )
 
-REFERENCE_RANGE = 2.6
-"""Median distance at which the noise was measured, metres."""
+REFERENCE_RANGE = 2.6  # median distance at which the noise was measured, metres
 
 FRAME_ID = "camera_optical_frame"
 

@@ -68,8 +68,7 @@ def drift(rng: np.random.Generator, times: Floats, std: ArrayLike, slowest_s: fl
     return std * (amplitude * np.sin(angle)).sum(axis=1)
 
 
-RATE = 120
-"""Frame rate of the simulated motions, frames per second."""
+RATE = 120  # frame rate of the simulated motions, frames per second
 
 LIFT, LAND = 0.05, 0.45
 """Phases at which the left foot's toe leaves the floor and its heel lands; the right foot is half a stride later."""

@@ -49,8 +49,7 @@ SPREAD_SPEED = 0.2
 FASTEST = 1.0
 """Speed above which the noise does not grow, m/s; the recordings contain too little faster motion for a fit."""
 
-LONGEST_JUMP = 1.2
-"""Longest jump, metres; a joint farther away would not be assigned to the body."""
+LONGEST_JUMP = 1.2  # longest jump, metres; a joint farther away would not be assigned to the body
 
 
 @dataclass(frozen=True)

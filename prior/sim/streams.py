@@ -22,8 +22,7 @@ from steadypose.prior.sim.noise import KINECT_NOISE, NoiseModel
 from steadypose.prior.sim.scripts import SCRIPTS
 from steadypose.prior.timing.resample import PERIOD_NS
 
-START_NS = 1_750_000_000_000_000_000
-"""Stamp of a stream's second 0, nanoseconds; arbitrary, but always the same."""
+START_NS = 1_750_000_000_000_000_000  # stamp of a stream's second 0, nanoseconds; arbitrary, but always the same
 
 _SHORTEST_S = 2.0
 

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from steadypose.prior.arrays import Bools, Floats
 from steadypose.prior.compiled import njit
 
-INITIAL_SPEED = 1.0
-"""Standard deviation of a joint's first velocity along an axis, m/s."""
+INITIAL_SPEED = 1.0  # standard deviation of a joint's first velocity along an axis, m/s
 
 
 class Smoothed(NamedTuple):

@@ -23,27 +23,17 @@ LOOK_AHEAD_NS = 10_000_000
 """Largest age of a frame at which it is extrapolated to the grid time without waiting for the next one, nanoseconds."""
 LOOK_AHEAD_PERIODS = 0.35
 """The same limit for fast streams, periods. Extrapolation by a whole period multiplies the noise variance by 5."""
-PERIOD_GAIN = 0.1
-"""Weight of the newest period in the running mean of a stream's periods."""
-
-RUNS = 9
-"""Number of new frames over which repetitions are counted."""
-RARE = 2
-"""Number of the longest counts that are ignored, because a simulated person without noise may stand still."""
-
-PERIODS = 7
-"""Number of frame intervals whose median is a stream's period."""
-REGULAR = (0.5, 1.5)
-"""Range of the intervals between the frames used, as multiples of the median."""
+PERIOD_GAIN = 0.1  # weight of the newest period in the running mean of a stream's periods
+RUNS = 9  # number of new frames over which repetitions are counted
+RARE = 2  # number of the longest counts that are ignored, because a simulated person without noise may stand still
+PERIODS = 7  # number of frame intervals whose median is a stream's period
+REGULAR = (0.5, 1.5)  # range of the intervals between the frames used, as multiples of the median
 ROUNDED, KEPT = 0.1, 0.55
 """Constants of the factor ``m``: it is the ratio of the rates minus the first, rounded, and is kept while it is off by
 less than the second."""
-MAX_FACTOR = 8
-"""Largest factor ``m``; in faster streams, only the nearest frames are used."""
-MEMORY_S = 0.5
-"""Time constant of the running means of squared residuals, seconds."""
-MIN_FRAMES = 6
-"""Number of frames of a joint before its noise is known."""
+MAX_FACTOR = 8  # largest factor ``m``; in faster streams, only the nearest frames are used
+MEMORY_S = 0.5  # time constant of the running means of squared residuals, seconds
+MIN_FRAMES = 6  # number of frames of a joint before its noise is known
 OUTLIER = 3.0
 """Largest residual at which a joint is filtered, standard deviations. Beyond it, the joint does not change, so that an
 outlier does not affect its neighbours. Squares are clipped in the mean at `OUTLIER` squared times the mean."""

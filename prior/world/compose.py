@@ -127,8 +127,7 @@ SWAY, MOVES = 0.015, 0.1
 """Standard deviations along an axis of the root's velocity over two resting feet, m/s: of a swaying body, and of a body
 that bends or shifts. In the training motion, half of the bodies with both feet at rest only sway."""
 
-SWAYS = 0.5
-"""Prior probability that a body with both feet at rest only sways."""
+SWAYS = 0.5  # prior probability that a body with both feet at rest only sways
 
 VELOCITY_ERROR = 0.3
 """Error-to-sigma ratio of the filter's velocity for a standing body with an observed root (validation)."""

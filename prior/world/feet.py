@@ -34,20 +34,14 @@ MEMORY_S = 1.5
 FLOOR_EASE_S = 0.05
 """Time constant with which feet are moved to the floor, seconds. Their offset lasts longer than this."""
 
-AIR_M = 0.1
-"""Range of heights above the floor assumed for feet that do not stand or stand on something else, metres."""
-
-OUTLIER = 0.05
-"""Probability that the floor's estimate is wrong."""
+AIR_M = 0.1  # range of heights above the floor assumed for feet that do not stand or stand on something else, metres
+OUTLIER = 0.05  # probability that the floor's estimate is wrong
 
 LYING_M = 0.25
 """Height of the pelvis above the floor below which a body lies, and the floor gives no height of its feet, metres."""
 
-DEADBAND = 0.5
-"""Largest distance of a published foot from its estimate, standard deviations."""
-
-EASE_S = 0.1
-"""Time constant with which a lifted foot returns to its estimate, seconds."""
+DEADBAND = 0.5  # largest distance of a published foot from its estimate, standard deviations
+EASE_S = 0.1  # time constant with which a lifted foot returns to its estimate, seconds
 
 _UP = np.array([0.0, 0.0, 1.0])
 

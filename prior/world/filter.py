@@ -17,11 +17,8 @@ from steadypose.prior.world.observe import FEET, SOLE, BodyObservation
 
 Sigma = TypeVar("Sigma", float, Floats)
 
-EASE_S = 0.1
-"""Time constant with which a body returns to its observations when its root is observed again, seconds."""
-
-FIRST_SIGMA = 1.0
-"""Standard deviation of a body's first root if no observation supports it, metres."""
+EASE_S = 0.1  # time constant with which a body returns to its observations when its root is observed again, seconds
+FIRST_SIGMA = 1.0  # standard deviation of a body's first root if no observation supports it, metres
 
 JITTER_SHARE = 0.3
 """Share of a joint's or velocity's standard deviation that is independent in each frame; the rest is slow bias."""
@@ -41,8 +38,7 @@ AT_ODDS_SIGMAS, AT_ODDS_MEMORY_S = 2.0, 0.2
 """Mean distance of the observed root above which the body is carried by what it stands on, standard deviations, and
 time constant of that mean, seconds. Feet and network then do not measure the motion in the world."""
 
-AT_ONE_SPEED = 0.3
-"""Difference between predicted and estimated velocity below which the prediction is used again, m/s."""
+AT_ONE_SPEED = 0.3  # difference between predicted and estimated velocity below which the prediction is used again, m/s
 
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
 _UP = np.array([0.0, 0.0, 1.0])

@@ -18,41 +18,30 @@ from steadypose.prior.world.observe import BodyObservation
 SOLE_SIGMA = 0.02
 """Standard deviation of a standing foot's height above the floor, over sources, people and stances, metres."""
 
-STANDING = 0.5
-"""Probability of rest above which a foot measures the floor."""
+STANDING = 0.5  # probability of rest above which a foot measures the floor
 
 UPRIGHT_M = 0.45
 """Height of the pelvis above the sole above which feet measure the floor, metres. It excludes bodies that lie."""
 
-CALIBRATED_SIGMA = 0.01
-"""Standard deviation of a calibrated floor's height, metres."""
-
-GUESS_SIGMA = 0.15
-"""Standard deviation of a floor height guessed from the lowest foot of the first frame, metres."""
-
-CREEP = 0.001
-"""Density of the random walk of the floor's height, metres over √s."""
+CALIBRATED_SIGMA = 0.01  # standard deviation of a calibrated floor's height, metres
+GUESS_SIGMA = 0.15  # standard deviation of a floor height guessed from the lowest foot of the first frame, metres
+CREEP = 0.001  # density of the random walk of the floor's height, metres over √s
 
 MEMORY_S = 0.5
 """Correlation time of the error of one standing foot, seconds. Frames closer together repeat a measurement."""
 
-GATE = 3.0
-"""Height above the floor above which a foot stands on something else, standard deviations."""
+GATE = 3.0  # height above the floor above which a foot stands on something else, standard deviations
 
 PATIENCE_S = 5.0
 """Time after which ground that feet stand on becomes the floor if no foot stands on the old one, seconds."""
 
-STEP_M = 0.10
-"""Least height of a new level above the floor or another level, metres."""
+STEP_M = 0.10  # least height of a new level above the floor or another level, metres
 
 STOOD_S = 0.3
 """Time for which feet must stand on a level before it counts, seconds. A jump is shorter."""
 
-REACH_M = 0.4
-"""Extent of a level beyond the positions where feet have stood, metres."""
-
-FORGOTTEN_S = 60.0
-"""Time of standing elsewhere after which a level is forgotten, seconds."""
+REACH_M = 0.4  # extent of a level beyond the positions where feet have stood, metres
+FORGOTTEN_S = 60.0  # time of standing elsewhere after which a level is forgotten, seconds
 
 
 @dataclass

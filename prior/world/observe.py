@@ -21,8 +21,7 @@ SOLE: Floats = np.array([0.07, 0.07, 0.022, 0.022])
 """Heights (4,) of `FEET` above the floor while they stand, metres. Medians over labelled contacts in each of the five
 sources of training motion, averaged over the sources."""
 
-MIN_SIGMA = 0.001
-"""Least standard deviation of a joint, which replaces smaller ones in the message, metres."""
+MIN_SIGMA = 0.001  # least standard deviation of a joint, which replaces smaller ones in the message, metres
 
 UNOBSERVED_ROOT_SIGMA = 0.05
 """Standard deviation added to that of a root which the prior inferred from other observed joints, metres."""
@@ -165,11 +164,8 @@ GUESSED_S = 2.0
 predicted contacts of feet against their mean is 0.36 while the feet are observed, 0.28 in the first 2 s after that,
 0.02 later, and -0.21 for feet never observed (benchmarks/NOTEBOOK.md)."""
 
-LEG_CONTACTS = slice(0, 6)
-"""The joints of legs among `CONTACTS`: knees, ankles and feet, left before right."""
-
-FEET_OF_LEGS = slice(2, 6)
-"""`FEET` among them."""
+LEG_CONTACTS = slice(0, 6)  # the joints of legs among `CONTACTS`: knees, ankles and feet, left before right
+FEET_OF_LEGS = slice(2, 6)  # `FEET` among them
 
 _JOINTS = [J[name] for name in CONTACTS[LEG_CONTACTS]]
 

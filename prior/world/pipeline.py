@@ -19,8 +19,7 @@ from steadypose.prior.world.core import BodyEstimate, Scene, WorldCore
 from steadypose.prior.world.observe import observe, unit_quaternion
 from steadypose.prior.world.settings import TrajectorySettings
 
-WORLD = "world"
-"""Frame id of all published messages."""
+WORLD = "world"  # frame id of all published messages
 
 MAX_SOURCES = 64
 """Largest number of sources whose state is kept; beyond it, the least recently received source is forgotten."""

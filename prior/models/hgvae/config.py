@@ -7,14 +7,9 @@ from typing import Any, NamedTuple
 
 from steadypose.prior.models.weights import WeightsError
 
-JOINT_NODES = 66
-"""Number of nodes: 22 joints with 3 coordinates each, node ``3 * joint + axis``."""
-
-SCALE = 0.2
-"""Unit of the networks' inputs and outputs, metres."""
-
-TRACK_LOG_VAR = -4.0
-"""Log-variance of tracks at an output of 0, in units of `SCALE`: a standard deviation of 2.7 cm."""
+JOINT_NODES = 66  # number of nodes: 22 joints with 3 coordinates each, node ``3 * joint + axis``
+SCALE = 0.2  # unit of the networks' inputs and outputs, metres
+TRACK_LOG_VAR = -4.0  # log-variance of tracks at an output of 0, in units of `SCALE`: a standard deviation of 2.7 cm
 
 
 class Level(NamedTuple):

@@ -25,20 +25,14 @@ RECENT = 15
 OFF_SCALE = 0.02
 """Unit of the residuals against HG-VAE, metres. They enter by asinh: linear if small, logarithmic if large."""
 
-ROUGH_SCALE = 0.003
-"""Unit of the RMS second difference of a track, which enters by its logarithm, metres."""
-
-SENSOR_SCALE = 0.01
-"""Unit of the sensor's error, which enters by its logarithm, metres."""
+ROUGH_SCALE = 0.003  # unit of the RMS second difference of a track, which enters by its logarithm, metres
+SENSOR_SCALE = 0.01  # unit of the sensor's error, which enters by its logarithm, metres
 
 MISSING = (0, 4, 8, 14)
 """Numbers of missing joints at which the calibration was measured; it is interpolated between them."""
 
-FROZEN_ODDS = 12.0
-"""Log odds of a joint whose last position the sensor repeats while the others jitter."""
-
-SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)
-"""Sensor errors along an axis at which the calibration was measured, metres."""
+FROZEN_ODDS = 12.0  # log odds of a joint whose last position the sensor repeats while the others jitter
+SENSOR_SIGMAS = (0.003, 0.01, 0.02, 0.04)  # sensor errors along an axis at which the calibration was measured, metres
 
 PACES, PACE_EDGES = (0.03, 0.5, 1.5), (0.274, 0.866)
 """Typical values of `pace` in three classes of windows, and the edges between the classes, m/s. In most windows of a

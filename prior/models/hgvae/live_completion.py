@@ -23,18 +23,14 @@ NEAR = 8.0
 """Distance at which the nearness of an observation, 1 / (1 + d / NEAR), is one half, frames. An exponential would not
 distinguish an arm that was observed a second ago from one that was never observed."""
 
-LAG = 5
-"""Interval over which the mobility of a joint relative to its parent is measured, frames."""
+LAG = 5  # interval over which the mobility of a joint relative to its parent is measured, frames
 
 GROWTH = 1.5
 """Exponent of the growth of the interpolation's variance with the time from an observation: 1 is a random walk, 2
 constant velocity. A learned exponent is dominated by faults of the training sensors, and moves arms that rest."""
 
-STILL = 0.004
-"""Least mobility of a joint along an axis in `LAG` frames, metres."""
-
-CENTIMETRE = 0.01 / SCALE
-"""Unit of the joints' noise, which enters by its logarithm: a centimetre in units of `SCALE`."""
+STILL = 0.004  # least mobility of a joint along an axis in `LAG` frames, metres
+CENTIMETRE = 0.01 / SCALE  # unit of the joints' noise, which enters by its logarithm: a centimetre in units of `SCALE`
 
 BIAS_SCALE = 0.01
 BIAS_MIN = 0.002
@@ -43,8 +39,7 @@ BIAS_MIN = 0.002
 HALF_CERTAIN_SIGMA = 0.01
 """Standard deviation along an axis at which a completed entry has a certainty of one half, metres."""
 
-FIRST_LOG_VAR = -3.0
-"""Log-variance at an output of 0, in units of `SCALE`: a standard deviation of 4.5 cm."""
+FIRST_LOG_VAR = -3.0  # log-variance at an output of 0, in units of `SCALE`: a standard deviation of 4.5 cm
 
 JOINTS = JOINT_NODES // 3
 

@@ -51,15 +51,13 @@ MULTIPLE_MODEL = len(DENSITIES)
 RAW = EXPERTS - 1
 """Indices of the last two experts."""
 
-MEAN_FRAMES = 18
-"""Length of the running means of distances and differences, frames."""
+MEAN_FRAMES = 18  # length of the running means of distances and differences, frames
 
 SHARED = 9.0
 """Weight of the geometric mean of the tracks' noise in the noise of each track, observations. Over a few frames, a fast
 track looks like a noisy one. Values of 4 to 15 differ by at most 1 % (validation)."""
 
-LOG_FLOOR = 3e-4
-"""Floor of lengths in logarithms, metres."""
+LOG_FLOOR = 3e-4  # floor of lengths in logarithms, metres
 
 LAGS = ((1, 1), (2, 1), (3, 1), (2, 3))
 """Order and spacing of the differences of raw positions, frames. Their sizes distinguish noise from motion."""

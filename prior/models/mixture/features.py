@@ -30,8 +30,7 @@ POSE_EXPERT, NOISE_EXPERT, HEADING_EXPERT = 3, 4, 2
 SHORT_MEAN_FRAMES, BONE_MEAN_FRAMES = 3, 30
 """Lengths of the short running mean of distances and of the running mean of bone lengths, frames; see `MEAN_FRAMES`."""
 
-SPEED_UNIT = 2.0
-"""Unit of velocities, m/s."""
+SPEED_UNIT = 2.0  # unit of velocities, m/s
 
 MAX_NOISE = 0.3
 """Bound at which residuals are clipped in the noise estimate, metres; it limits outliers that passed the gate."""
@@ -51,8 +50,7 @@ _DELAY = _OBSERVED + 6
 """Offsets of the groups of features. The groups are: three log-distances for each pair of neighbouring experts (the
 smoothers by density, then the raw joint), vectors between these experts, sizes of differences, bone, pose,
 multiple-model estimate, observation, and delay."""
-FEATURES = _DELAY + len(_DELAYS) + 1
-"""Number of features of a joint."""
+FEATURES = _DELAY + len(_DELAYS) + 1  # number of features of a joint
 
 OUTPUTS = 2 * EXPERTS + 4
 """Number of outputs of a joint: logits of the weights w, then b, the correction r (3), the log standard deviation."""
@@ -60,14 +58,9 @@ OUTPUTS = 2 * EXPERTS + 4
 GATES = 3
 """Number of gates of a joint, the weights of the last frame's output: for w and b, for r, and for the deviation."""
 
-REACH = 1.0
-"""Bound of each b, which limits how far the estimate may leave the experts' convex hull."""
-
-CORRECTION = 2.0
-"""Bound of the correction along an axis, in units of the estimated noise."""
-
-COASTING = 0.1
-"""Least growth of a joint's standard deviation with the time to its nearest observation, m/s."""
+REACH = 1.0  # bound of each b, which limits how far the estimate may leave the experts' convex hull
+CORRECTION = 2.0  # bound of the correction along an axis, in units of the estimated noise
+COASTING = 0.1  # least growth of a joint's standard deviation with the time to its nearest observation, m/s
 
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -3.0, 6.0
 """Range of the natural logarithm of the standard deviation, which is in millimetres."""

@@ -29,14 +29,9 @@ MEMORY = 9
 MIN_SCALE = 1e-4
 """Term added to each normalised squared innovation; it limits the noise to at least 1 % of `MEASUREMENT_SIGMA`."""
 
-HELD, SETTLED = 3, 4
-"""Numbers of frames for which a joint must be missing to leave the body, and observed to join it."""
-
-MIN_EIGENVALUE = 1e-5
-"""Least eigenvalue of a mode relative to the joints' mean variance, because no mode is rigid."""
-
-INITIAL_SPEED = 1.0
-"""Standard deviation of a new joint's velocity along an axis, m/s."""
+HELD, SETTLED = 3, 4  # numbers of frames for which a joint must be missing to leave the body, and observed to join it
+MIN_EIGENVALUE = 1e-5  # least eigenvalue of a mode relative to the joints' mean variance, because no mode is rigid
+INITIAL_SPEED = 1.0  # standard deviation of a new joint's velocity along an axis, m/s
 
 
 @cache

@@ -17,8 +17,7 @@ from steadypose.prior.body.skeleton import PARENT
 from steadypose.prior.body.vectors import apart
 from steadypose.prior.compiled import median, njit
 
-MEMORY, LEAST = 45, 5
-"""Length of the running moments of a bone's length, and least number of observations, frames."""
+MEMORY, LEAST = 45, 5  # length of the running moments of a bone's length, and least number of observations, frames
 
 START, START_NEWEST = 5, 15
 """Weight of the initial whiteness of 0, frames; the second without delay, where the network gains more over the
@@ -40,8 +39,7 @@ LARGE, LARGE_NEWEST = 0.014, 0.01
 """White noise along an axis in which the weight of the multiple-model estimate is at most three quarters, metres; the
 second without delay. The limit is 1 in much smaller noise and 0.5 in much larger noise, where the network helps."""
 
-STILL = 1e-3
-"""Least standard deviation of a bone's length for its whiteness to count, metres."""
+STILL = 1e-3  # least standard deviation of a bone's length for its whiteness to count, metres
 
 _BONES = len(PARENT) - 1
 
