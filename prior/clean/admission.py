@@ -16,27 +16,27 @@ MAX_DISTANCE = 30.0
 """Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
 MAX_PLACE = 10_000.0
 """Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
-LASTING = 3
-"""Number of consecutive messages with increasing stamps after which a jump of stamps is accepted. The source paused, or
+ACCEPT_AFTER = 3
+"""Number of consecutive messages with increasing stamps after which a jump of stamps is accepted: the source paused, or
 its clock was set."""
 SLOWEST_NS = 10_000_000_000
-"""Longest time between two stamps of a stream, nanoseconds; a slower stream pauses before every message."""
+"""Longest time between two stamps of a stream, nanoseconds. In a slower stream, every message follows a pause."""
 STEP_M, SPEED = 0.5, 10.0
 """Largest motion of a sensor since its last accepted pose: STEP_M + SPEED * elapsed, metres and m/s. A running robot
 reaches 4 m/s."""
 TURN, TURN_RATE = 0.5, 10.0
 """Largest rotation of a sensor since then: TURN + TURN_RATE * elapsed, radians and rad/s. A person's head turns at up
 to 6 rad/s."""
-LASTING_S = 0.2
+ACCEPT_AFTER_S = 0.2
 """Time after which a suspect pose is accepted, seconds. The sensor was moved or calibrated."""
 
 
 class StampGate:
-    """Holds back messages whose stamps jump until it is clear whether the jump lasts.
+    """Holds back messages whose stamps jump, until the following messages confirm or refute the jump.
 
-    If the stream continues from the old stamp, the jump was a wrong stamp (0, seconds ahead, the year 2037). The
-    message is dropped and counted. If it continues from the new stamp, the source paused or its clock was set. Then
-    nothing is lost: the two messages held back are released with the third.
+    If the stream continues from the old stamp, the stamp was wrong (0, seconds ahead, the year 2037), and the message
+    is dropped and counted. If the stream continues from the new stamp, the source paused or its clock was set. Then the
+    two messages held back are released with the third, and nothing is lost.
 
     Args:
         timeout_ns: longest time between two stamps of a stream, unless the whole stream is slower.
@@ -54,7 +54,7 @@ class StampGate:
         """Return the messages to process now, with their times of arrival, oldest first; none while a jump is being
         judged.
 
-        If this node dropped messages before it (``gap``), its stamp may be later than usual.
+        After messages that the node dropped (``gap``), a stamp may be later than usual.
         """
         if raw.end_of_stream:
             return [*self.release(), (raw, at_ns)]
@@ -66,7 +66,7 @@ class StampGate:
         if self._held and not 0 < raw.stamp_ns - self._held[-1][0].stamp_ns <= SLOWEST_NS:
             self._drop()
         self._held.append((raw, at_ns))
-        return self.release() if len(self._held) >= LASTING else []
+        return self.release() if len(self._held) >= ACCEPT_AFTER else []
 
     def release(self) -> list[tuple[PoseRaw, int]]:
         """Return the messages held back, oldest first, as the beginning of a new stream."""
@@ -96,11 +96,11 @@ class Verdict(Enum):
     SUSPECT = auto()
     """a jump that may be an outlier: skip this frame"""
     MOVED = auto()
-    """a jump that has lasted: the sensor was moved, start anew"""
+    """a confirmed jump: the sensor was moved, start anew"""
 
 
 class SensorPoseGate:
-    """Rejects sensor poses that jump, until the jump has lasted for `LASTING_S`. A still or moving sensor passes."""
+    """Rejects sensor poses after a jump, for at most `ACCEPT_AFTER_S`. A still or moving sensor passes."""
 
     def __init__(self) -> None:
         self._accepted: tuple[int, Pose] | None = None
@@ -117,7 +117,7 @@ class SensorPoseGate:
             return Verdict.ACCEPTED
         if self._suspect_since_ns is None:
             self._suspect_since_ns = stamp_ns
-        if stamp_ns - self._suspect_since_ns < LASTING_S * 1e9:
+        if stamp_ns - self._suspect_since_ns < ACCEPT_AFTER_S * 1e9:
             return Verdict.SUSPECT
         self._accepted, self._suspect_since_ns = (stamp_ns, pose), None
         return Verdict.MOVED

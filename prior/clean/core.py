@@ -44,9 +44,11 @@ class _Newest(NamedTuple):
     present: Bools  # (S,) which slots hold a body
     person: Person
     bias: SensorBias  # estimated up to this frame
-    lasting: Floats  # (S,) certainty that the sensor's noise lasts
-    correlated_sigma: Floats  # (S,) metres along an axis, the bias, none where noise is known to be white
-    left_out: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
+    correlated: Floats  # (S,) certainty that the sensor's noise is time-correlated, 0 to 1
+    correlated_sigma: Floats  # (S,) metres along an axis, the time-correlated part of the sensor's error
+    omitted_sigma: (
+        Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
+    )
     rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
     imputed: Imputed | None  # the last frames, completed; None if no body is
@@ -120,7 +122,7 @@ class CleanCore:
             correlated_sigma = (1.0 - self._smooth.white) * bias_sigma
             smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter, correlated_sigma)
         bias = self._bias.update(smoothed, person, gated.jitter)
-        left_out = self._depth_error.update(smoothed, self._smooth.white)
+        omitted_sigma = self._depth_error.update(smoothed, self._smooth.white)
         person = self._person.update(smoothed, bias.bias_sigma, present)
         score = Score.unscored(len(present))
         if self._score:
@@ -133,8 +135,9 @@ class CleanCore:
             self._noise = gated.jitter[present], bias.bias_sigma[present]
         correlated_sigma = (1.0 - self._smooth.white) * bias.bias_sigma
         self._newest = newest = _Newest(
-            gated, present, person, bias, self._smooth.lasting, correlated_sigma, left_out, rotations, score, imputed
-        )
+            gated, present, person, bias, self._smooth.correlated, correlated_sigma, omitted_sigma, rotations, score,
+            imputed,
+        )  # fmt: skip
         return None if smoothed is None else self._fused(smoothed, newest, self._delay)
 
     def flush(self) -> list[CleanFrame]:
@@ -178,18 +181,18 @@ class CleanCore:
             newest.bias,
             newest.rotations[at],
             imputed and Imputed(imputed.positions[at], imputed.sigma[at]),
-            self._history.unseen_s[at],
-            self._history.seen_since(back),
+            self._history.unobserved_s[at],
+            self._history.observed_since(back),
             newest.present,
             Track(self._history.positions, len(self._history.positions) - 1 - back, newest.gated.jitter),
         )
         if self._posture:
             noise = np.hypot(newest.gated.jitter, newest.correlated_sigma)
-            estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.lasting)
+            estimate = self._posture.update(estimate, newest.bias.lengths, noise, newest.correlated)
         if self._steady:
-            estimate = self._steady.update(estimate, smoothed.step, self._history.positions[at], newest.lasting)
-        estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.left_out[:, None]))
-        mixed = mix(estimate, self._history.unseen_s[at])
+            estimate = self._steady.update(estimate, smoothed.step, self._history.positions[at], newest.correlated)
+        estimate = replace(estimate, sigma=np.hypot(estimate.sigma, newest.omitted_sigma[:, None]))
+        mixed = mix(estimate, self._history.unobserved_s[at])
         if self._orient:
             oriented = self._orient.update(replace(mixed, sigma=estimate.sigma))
             mixed = replace(mixed, rotations=oriented.rotations)

@@ -1,9 +1,10 @@
-"""Left and right exchanged: limbs, or the whole body, are put back.
+"""Detects limbs, or whole bodies, whose left and right are exchanged, and swaps them back.
 
-Detectors take left for right, for a frame or for seconds. Two things tell. A limb that is exchanged jumps to the other
-side, so each side is nearer to the other's prediction. And a body whose sides are exchanged is no human posture: its
-knees and feet point backwards, or its limbs cross. The jump tells at once, but not what was right before it; the
-posture (`prior.models.posture`) tells which of the two labellings is right, at a body's first frame and after a while.
+Detectors take left for right, for a frame or for seconds. Two cues show it. An exchanged limb jumps to the other side,
+so each side is nearer to the other's prediction. And a body with exchanged sides is no human posture: its knees and
+feet point backwards, or its limbs cross. The jump shows at once, but not which labelling was right before it. The
+Gaussian of postures (`prior.models.posture`) shows which labelling is right, in a body's first frames and after a
+while.
 """
 
 from __future__ import annotations
@@ -21,17 +22,19 @@ from steadypose.prior.timing.rate import FPS
 
 APART = 0.15  # least mean distance of a limb's joints to their predictions to test for an exchange, metres
 BETTER = 0.4  # share to which an exchange must reduce that distance
-LASTS = 4  # number of frames from which on an exchange lasts: a limb is then exchanged as long as it is nearer so
+CONFIRMED = (
+    4  # number of frames after which an exchange is confirmed: it then ends when the limb is no longer nearer so
+)
 SIGMA = 0.03  # standard deviation of joints along an axis, when postures are compared, metres
-FIRST = 15  # largest number of a body's first frames that are tested, until one order is likelier by far
+FIRST = 15  # largest number of a body's first frames that are tested, until one labelling is far likelier
 
 RATIO, MARGIN = 1.25, 5.0
-"""An order is likelier by far if the other's misfit exceeds this multiple of its own by this margin. Of 7,500 right
+"""A labelling is far likelier if the other's misfit exceeds this multiple of its own by this margin. Of 7,500 right
 frames of validation people, none seems exchanged, with noise of 4 cm one; of exchanged bodies 98.6 and 92 % do."""
 
 POSSIBLE = 60.0
-"""Largest misfit of a likelier order. 95 % of right postures have at most 50 with 2 cm of noise; with 4 cm, and 12 cm
-along a camera's ray, half have more than 90, and chance decides between orders."""
+"""Largest misfit of a likelier labelling. 95 % of right postures have at most 50 with 2 cm of noise; with 4 cm, and 12
+cm along a camera's ray, half have more than 90, and misfits do not distinguish labellings."""
 
 MEMORY = 9  # length of the running mean of misfits, frames
 
@@ -43,8 +46,8 @@ _CORNERS = [*HIPS, *SHOULDERS]
 
 
 def _orders() -> NDArray[np.intp]:
-    """(3, 3, 22) orders of a body's joints in which arms and legs are as given, exchanged, or exchanged with their
-    bases."""
+    """(3, 3, 22) labellings: orders of a body's joints in which arms and legs are as given, exchanged, or exchanged
+    with their bases."""
     orders = np.tile(np.arange(22), (3, 3, 1))
     arms, legs = ((*base, *chain) for base, chain in zip(_BASES, _CHAINS, strict=True))
     for a, of_arms in enumerate(((), _CHAINS[0], arms)):
@@ -58,19 +61,19 @@ _ORDERS = _orders().reshape(9, 22)
 _EXCHANGED = np.array(np.unravel_index(np.arange(9), (3, 3))) > 0
 """(2, 9) whether arms, and legs, are exchanged in each order."""
 _FIRST_ORDERS = np.array([0, 2, 3, 5, 6, 8])
-"""Orders that are tested in a body's first frames, where no jump tells. Not exchanged are legs without their hips: a
-dancer's crossed legs seem to be."""
+"""Labellings that are tested in a body's first frames, in which no jump shows. Exchanged legs without their hips are
+not among them, because crossed legs look the same."""
 
 
 class ExchangedLimbs:
-    """Puts exchanged limbs of ``slots`` bodies back. An exchange that lasts longer than ``patience_s`` is accepted,
-    unless it makes a posture less likely."""
+    """Swaps exchanged limbs of ``slots`` bodies back. A labelling that persists for longer than ``patience_s`` is
+    accepted, unless it makes the posture less likely."""
 
     def __init__(self, patience_s: float, slots: int) -> None:
         self._patience = patience_s * FPS
         self._posture = LivePosture.load("default")
         self._tests = np.full(slots, FIRST)
-        self._since = np.zeros((slots, len(_LIMBS)))  # frames put back less frames not put back
+        self._since = np.zeros((slots, len(_LIMBS)))  # number of frames swapped back less number of others
         self._misfit = np.zeros((slots, len(_ORDERS)))
         self._frames = np.zeros(slots)
 
@@ -81,28 +84,32 @@ class ExchangedLimbs:
             values[slot] = 0
 
     def begin(self, positions: Floats) -> Bools:
-        """Put back, in place, limbs of (S, 22, 3) metres, NaN where unobserved, of bodies in whose first frames another
-        order of `_FIRST_ORDERS` is likelier. Return the joints (S, 22) that were.
+        """Swap limbs back, in place, in the first frames of bodies (S, 22, 3) metres, NaN where unobserved, for which
+        another of `_FIRST_ORDERS` is far likelier. Return which joints (S, 22) were swapped.
         """
         back = np.zeros(positions.shape[:2], dtype=bool)
-        seen = np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)
-        for slot in np.flatnonzero((self._tests > 0) & seen):
+        for slot in np.flatnonzero((self._tests > 0) & np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)):
             self._tests[slot] -= 1
             misfit = self._posture.misfit(positions[slot, _ORDERS], SIGMA)
             best = _FIRST_ORDERS[misfit[_FIRST_ORDERS].argmin()]
             if misfit[best] < POSSIBLE and misfit[0] > RATIO * misfit[best] + MARGIN:
                 positions[slot] = positions[slot, _ORDERS[best]]
                 back[slot] = _ORDERS[best] != np.arange(22)
-                self._since[slot], self._misfit[slot], self._frames[slot] = (LASTS + 1) * _EXCHANGED[:, best], misfit, 1
+                self._since[slot], self._misfit[slot], self._frames[slot] = (
+                    (CONFIRMED + 1) * _EXCHANGED[:, best],
+                    misfit,
+                    1,
+                )
             if back[slot].any() or misfit[_FIRST_ORDERS[1:]].min() > RATIO * misfit[0] + MARGIN:
                 self._tests[slot] = 0
         return back
 
     def update(self, positions: Floats, expected: Floats, distance: Floats) -> tuple[int, Bools]:
-        """Put limbs of (S, 22, 3) metres back, in place, given their predictions (S, 22, 3), NaN where unknown, and
-        their distances (S, 22) to these.
+        """Swap exchanged limbs of bodies (S, 22, 3) metres back, in place, given the joints' predictions (S, 22, 3),
+        NaN where unknown, and their distances (S, 22) from these.
 
-        Returns how many pairs of limbs were put back, and the joints (S, 22) for which this is given up in this frame.
+        Returns how many pairs of limbs were swapped, and for which joints (S, 22) swapping ends in this frame, because
+        the new labelling is accepted.
         """
         given_up = np.zeros(distance.shape, dtype=bool)
         if not (self._since.any() or (distance > APART).any()):
@@ -111,8 +118,8 @@ class ExchangedLimbs:
         hidden = np.isfinite(expected[..., 0]) & np.isnan(distance)
         whole = np.stack([~hidden[:, pair].any(axis=1) for pair in _LIMBS], axis=-1)
         far = whole & (keep > APART) & (swap < BETTER * keep)
-        # while an exchange lasts, or if other limbs are exchanged, limbs beside each other are too
-        jumped = far | (swap < keep) & ((self._since >= LASTS) | far.any(axis=1, keepdims=True))
+        # during a confirmed exchange, or if other limbs are exchanged, also limbs that are near each other
+        jumped = far | (swap < keep) & ((self._since >= CONFIRMED) | far.any(axis=1, keepdims=True))
         # most frames are right, so one exchanged frame does not confirm another at the beginning
         self._since = np.maximum(self._since + np.where(jumped, 1, -1), 0)
         self._compare(positions)
@@ -130,7 +137,7 @@ class ExchangedLimbs:
         return int(jumped.sum()), given_up
 
     def _compare(self, positions: Floats) -> None:
-        """Update the misfits of bodies (S, 22, 3), as observed, with limbs that are being put back."""
+        """Update the misfits of bodies (S, 22, 3), as observed, of which limbs are being swapped."""
         active = self._since.any(axis=1)
         self._frames[~active], self._misfit[~active] = 0, 0.0
         for slot in np.flatnonzero(active & np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)):
@@ -140,7 +147,7 @@ class ExchangedLimbs:
 
 
 def _kept_and_exchanged(positions: Floats, expected: Floats, pair: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """(S,) metres, mean distance of the joints ``pair`` that are observed on both sides to their predictions: as
+    """(S,) metres, mean distance from their predictions of those joints of ``pair`` that are observed on both sides: as
     observed, and with sides exchanged; NaN if there is none."""
     keep = distances(positions[:, pair], expected[:, pair])
     swap = distances(positions[:, MIRROR[pair]], expected[:, pair])

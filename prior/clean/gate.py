@@ -32,9 +32,9 @@ class Gate:
     mirrored about the image plane are mirrored back.
 
     A constant-velocity Kalman filter, updated with the accepted joints, predicts each joint. A joint far from its
-    prediction is still accepted if its bones kept their lengths and the sensor's bone lengths are constant enough to
-    tell (`BoneOutliers`). No jump is rejected for longer than ``patience``: by then the prediction is wrong, not the
-    sensor. A body that jumps as a whole is rejected for a few frames only, and not after a gap.
+    prediction is still accepted if its bones kept their lengths and the sensor's bone lengths are constant enough
+    (`BoneOutliers`). No jump is rejected for longer than ``patience``: by then the prediction is assumed to be wrong. A
+    body that jumps as a whole is rejected for a few frames only, and not after a gap.
     """
 
     def __init__(self, settings: GateSettings, slots: int, counters: Counter[str]) -> None:
@@ -93,7 +93,7 @@ class Gate:
         return Gated(observation, positions, self._jitter.copy(), frozen | mirrored)
 
     def _put_back(self, positions: Floats, expected: Smoothed, distance: Floats) -> bool:
-        """Put exchanged limbs back, in place; return whether a distance to a prediction has changed."""
+        """Swap exchanged limbs back, in place; return whether a distance from a prediction has changed."""
         exchanged, given_up = self._exchanged.update(positions, expected.positions, distance)
         if not (exchanged or given_up.any()):
             return False

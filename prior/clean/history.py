@@ -58,7 +58,7 @@ class History:
     """The last frames of S bodies, oldest first. The pipeline appends; all stages read.
 
     When a body reappears after at most `BRIDGED` frames without any joint, linear interpolation fills in its
-    `positions` in those frames. `unseen_s` still counts them as unobserved.
+    `positions` in those frames. `unobserved_s` still counts them as unobserved.
     """
 
     def __init__(self, frames: int, slots: int) -> None:
@@ -67,7 +67,7 @@ class History:
         self._observed = Ring(frames, (slots, 22, 3))
         self._confidence = Ring(frames, (slots, 22), fill=0.0)
         self._positions = Ring(frames, (slots, 22, 3))
-        self._unseen_s = Ring(frames, (slots, 22), fill=np.inf)
+        self._unobserved_s = Ring(frames, (slots, 22), fill=np.inf)
         self._lost = np.zeros(slots, dtype=np.int64)
 
     @property
@@ -86,13 +86,13 @@ class History:
         return self._positions.all
 
     @property
-    def unseen_s(self) -> Floats:
+    def unobserved_s(self) -> Floats:
         """(T, S, 22) seconds since each joint was last observed, at each frame; 0 if in that frame, inf if never."""
-        return self._unseen_s.all
+        return self._unobserved_s.all
 
-    def seen_since(self, back: int) -> Bools:
+    def observed_since(self, back: int) -> Bools:
         """(S, 22) whether each joint was observed in one of the ``back`` newest frames."""
-        return np.asarray((self.unseen_s[len(self.unseen_s) - back :] == 0.0).any(axis=0))
+        return np.asarray((self.unobserved_s[len(self.unobserved_s) - back :] == 0.0).any(axis=0))
 
     def append(self, gated: Gated) -> None:
         """Append the newest frame."""
@@ -100,12 +100,12 @@ class History:
         self._confidence.push(gated.observation.confidence)
         self._positions.push(gated.positions)
         seen = np.isfinite(gated.positions[..., 0])
-        self._unseen_s.push(np.where(seen, 0.0, self._unseen_s.newest + 1 / FPS))
+        self._unobserved_s.push(np.where(seen, 0.0, self._unobserved_s.newest + 1 / FPS))
         self._bridge(np.asarray(seen.any(axis=1)))
 
     def forget(self, slot: Bools) -> None:
         """Forget the bodies in these slots (S,)."""
-        for ring in (self._observed, self._confidence, self._positions, self._unseen_s):
+        for ring in (self._observed, self._confidence, self._positions, self._unobserved_s):
             ring.clear(slot)
         self._lost[slot] = 0
 

@@ -1,11 +1,11 @@
-"""Limbs mirrored about the image plane: found at the onset, and mirrored back.
+"""Detects limbs that are mirrored about the image plane, and mirrors them back.
 
-An image hardly shows whether an arm points to the camera or away from it, so estimators of depth mistake the sign of
-a limb's depth relative to its root, for seconds. Most mirrored limbs are possible poses with the right bone lengths.
-But the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored back.
-The end is found by the same test. If the root is off along the ray too, the whole body jumped. Near the image plane
-neither is seen, so no limb is mirrored back for long. Neither is seen in a limb that was hidden, because nobody knows
-where it went: such a limb is accepted.
+An image hardly shows whether an arm points to the camera or away from it, so estimators of depth may give a limb's
+depth relative to its root the wrong sign, for seconds. Most mirrored limbs are possible poses with the right bone
+lengths. But the onset is no possible movement: from one frame to the next, the limb continues better if it is mirrored
+back. The same test detects the end. If the root jumps along the ray too, the whole body jumped, and nothing is
+mirrored. Onset and end do not show near the image plane, so no limb is mirrored back for long, nor after a gap in the
+observations, so a limb is accepted as it reappears.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ IN_A_ROW = 3
 must be hidden before its fault is over."""
 
 LONGEST, REMEMBERED = 30, 300
-"""Longest time for which a limb is mirrored back, and time for which it is remembered that this was given up, frames.
-While it is remembered, the next onset is taken for the end of the fault."""
+"""Longest time for which a limb is mirrored back, and time after this in which the next onset is taken for the end of
+the fault, frames."""
 
 MIN_RANGE = 0.8
-"""Least distance of a limb's root from the sensor, metres. Nearer joints are relative to the body, not to a camera, and
-no ray is known."""
+"""Least distance of a limb's root from the sensor, metres. Nearer joints are assumed to be relative to the body, not to
+a camera, so that no ray is known."""
 
 _PARTS = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "foot")
 _LIMBS = np.array([[*limb, -1][:4] for limb in limbs(*_PARTS)])
@@ -62,15 +62,16 @@ class MirroredLimbs:
             values[slot] = 0
 
     def update(self, positions: Floats, expected: Floats, camera: Floats) -> tuple[Bools, Bools]:
-        """Mirror limbs of (S, 22, 3) metres, NaN where unobserved, back, in place, given their predictions (S, 22, 3),
-        NaN where unknown, and the position (3,) of the sensor.
+        """Mirror limbs of bodies (S, 22, 3) metres, NaN where unobserved, back, in place, given the joints' predictions
+        (S, 22, 3), NaN where unknown, and the sensor's position (3,).
 
-        Returns (S, 22) joints that were mirrored back, and joints for which this is given up in this frame.
+        Returns which joints (S, 22) were mirrored back, and for which (S, 22) this ends in this frame although the
+        fault may last, because the limb was mirrored back for too long or hidden.
         """
         back = np.zeros(positions.shape[:2], dtype=np.bool_)
         given_up = np.zeros_like(back)
-        seen, rows = np.isfinite(positions[..., 0]), self._observed
-        self._observed = np.where(seen, np.maximum(rows, 0) + 1, np.minimum(rows, 0) - 1)
+        observed, frames = np.isfinite(positions[..., 0]), self._observed
+        self._observed = np.where(observed, np.maximum(frames, 0) + 1, np.minimum(frames, 0) - 1)
         _mirror_back(
             positions, expected, camera, self._observed, self._square, self._frames, self._since, back, given_up
         )
@@ -79,9 +80,9 @@ class MirroredLimbs:
 
 @njit(cache=True)
 def _mirror_back(positions, expected, camera, observed, square, frames, since, back, given_up):
-    """Compute `MirroredLimbs.update`. ``observed`` (S, 22) counts the frames in a row in which each joint was observed;
-    negative, hidden. ``since`` (S, 4) counts the frames for which a limb has been mirrored back; negative, those for
-    which it will still be remembered that this was given up."""
+    """Compute `MirroredLimbs.update`. ``observed`` (S, 22) is the number of frames in a row in which each joint was
+    observed; negative, hidden. ``since`` (S, 4) is the number of frames for which a limb has been mirrored back;
+    negative, the number of frames that are left of `REMEMBERED`."""
     ray = np.empty(3)
     for row in range(len(positions)):
         for limb in range(len(_LIMBS)):
@@ -89,13 +90,13 @@ def _mirror_back(positions, expected, camera, observed, square, frames, since, b
             if now != 0:
                 now += 1
             away = _to_limb(positions[row, root], camera, ray)
-            seen, moved, kept, mirrored, across = _distances(
+            known, moved, kept, mirrored, across = _distances(
                 positions[row], expected[row], observed[row], root, joints, ray, now > 0
             )
             shift = 0.0
             for axis in range(3):
                 shift += (positions[row, root, axis] - expected[row, root, axis]) * ray[axis]
-            if seen > 0 and away > MIN_RANGE and (now > 0 or abs(shift) < LEAST):
+            if known > 0 and away > MIN_RANGE and (now > 0 or abs(shift) < LEAST):
                 far = frames[row, limb] >= FIRST and kept > max(LEAST**2, DEVIATIONS**2 * square[row, limb])
                 if far and (now > 0 or moved >= 2) and mirrored + across < BETTER**2 * (kept + across):
                     kept, now = mirrored, 1 if now == 0 else 0
@@ -128,11 +129,11 @@ def _to_limb(root, camera, ray):
 
 @njit(cache=True)
 def _distances(positions, expected, observed, root, joints, ray, held):
-    """Return how many joints have a prediction, how many moved, and mean square distances to predictions, m²: along the
-    ray as observed, along the ray if mirrored, and across it.
+    """Return how many joints have a prediction, how many moved, and mean squared distances from predictions, m²: along
+    the ray as observed, along the ray if mirrored, and across it.
 
-    ``held`` says whether the limb is being mirrored back. What is mirrored is relative to the root, whose noise counts
-    too; what is not is more certain by itself.
+    ``held`` is whether the limb is being mirrored back. A mirrored depth is relative to the root, and so contains the
+    root's noise; a depth as observed is compared without the root.
     """
     count, moved, kept, mirrored, across = 0, 0, 0.0, 0.0, 0.0
     for joint in joints:

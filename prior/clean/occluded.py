@@ -36,23 +36,23 @@ from steadypose.prior.timing.rate import FPS
 Weigher = Callable[[Occluded], Weighed]
 
 FORGETTING_S = 2.0, 10.0
-"""Times hidden at which the completion's deviation begins to be added to a joint's, and from which all of it is,
-seconds. The network is trained on 3 s. For joints hidden for 4 to 10 s its error-to-sigma ratio is 1.3 to 1.6, and with
-this correction 0.9 to 1.1 (validation)."""
+"""Seconds hidden after which the completion's standard deviation begins to be added to a joint's, and after which all
+of it is added. The network is trained on gaps of 3 s. For joints hidden for 4 to 10 s, its error-to-sigma ratio is 1.3
+to 1.6, and with this correction 0.9 to 1.1 (validation)."""
 
-_LEGS, _UNSEEN_LEG = limbs(("knee", "ankle", "foot")), 1.4
-_ARMS, _UNSEEN_ARM = limbs(("shoulder", "elbow", "wrist")), 1.6
-_WAIST, _UNSEEN_WAIST = [*HIPS, J["spine1"], J["spine2"]], 2.0
-"""Parts of the body, and factors on the completion's deviation for hips and lower spine, and for the joints below a
-leg's hip and an arm's shoulder, if no joint of that part was ever observed. Without them, the error-to-sigma ratio on
+_LEGS, _UNOBSERVED_LEG = limbs(("knee", "ankle", "foot")), 1.4
+_ARMS, _UNOBSERVED_ARM = limbs(("shoulder", "elbow", "wrist")), 1.6
+_WAIST, _UNOBSERVED_WAIST = [*HIPS, J["spine1"], J["spine2"]], 2.0
+"""Parts of the body, and factors on the completion's standard deviation for a part of which no joint was ever observed:
+hips and lower spine, a leg below the hip, an arm below the shoulder. Without these factors, the error-to-sigma ratio on
 validation people is 1.7 to 2.2 for hips and lower spine, 1.4 for legs, 1.46 for elbows and 1.73 for wrists."""
 
 _OF_ARMS = np.isin(np.arange(22), np.ravel(_ARMS))
 
 POSTURE_SHARE = 0.5
-"""Share of the Gaussian of postures in the position of a joint of an arm that was never observed; half of the rest is
-the averaged completion's, half a standing adult's (validation: 130 mm, 166 without the Gaussian). For legs, whose bones
-are unknown too, the Gaussian brings nothing."""
+"""Share of the Gaussian of postures in the position of an arm's joint that was never observed. Half of the rest is the
+averaged completion's, half a standing adult's (validation: 130 mm, 166 without the Gaussian). It does not improve legs,
+whose bones are unknown too."""
 
 DENSITIES = np.array([0.05, 0.3, 1.8, 10.0, 60.0])
 """Spectral densities of the acceleration noise of the filters that bridge a gap, m²/s³."""
@@ -103,10 +103,10 @@ class OccludedJoints:
     def update(
         self,
         slots: NDArray[np.intp],
-        seen: Floats,
+        positions: Floats,
         sigma: Floats,
-        unseen_s: Floats,
-        seen_later: Bools,
+        unobserved_s: Floats,
+        observed_later: Bools,
         completed: Floats,
         completed_sigma: Floats | None,
         offsets: Floats,
@@ -115,47 +115,50 @@ class OccludedJoints:
         """Estimate the occluded joints of B bodies; None if no joint is completed.
 
         A joint is occluded if another joint of its body was observed more recently. A frame without any observation
-        therefore occludes no joint. A joint that was never observed is placed halfway between two positions: the
-        running mean of its completions, moved along with the body, and its position in a standing adult. An arm is
-        halfway from there to its expectation in the Gaussian of postures.
+        therefore occludes no joint. A joint that was never observed gets the mean of two positions: the running mean of
+        its completions, moved along with the body, and its position in a standing adult. An arm is then moved halfway
+        to its expectation under the Gaussian of postures.
 
         Args:
             slots: (B,) slots of the bodies.
-            seen: (B, 22, 3) metres, from the smoother; NaN for joints never observed.
+            positions: (B, 22, 3) metres, from the smoother; NaN for joints never observed.
             sigma: (B, 22) metres along an axis, from the smoother; inf for joints never observed.
-            unseen_s: (B, 22) seconds since each joint was last observed.
-            seen_later: (B, 22) whether each joint is observed again within the delay.
+            unobserved_s: (B, 22) seconds since each joint was last observed.
+            observed_later: (B, 22) whether each joint is observed again within the delay.
             completed: (B, 22, 3) metres, from the completion network.
             completed_sigma: (B, 22) metres along an axis, inf for joints that are not completed; None if no body is.
             offsets: (B, 22, 3) metres, the people's bones.
             track: the observations of all slots.
         """
-        held = np.empty_like(seen)
-        observe(self._past, slots, seen, sigma, unseen_s, held)
+        held = np.empty_like(positions)
+        observe(self._past, slots, positions, sigma, unobserved_s, held)
         if completed_sigma is None:
             return None
         known = np.isfinite(completed_sigma + completed[..., 0])
         if not known.any():
             return None
-        never = known & np.isinf(unseen_s)
+        never = known & np.isinf(unobserved_s)
         occluded = (
-            known & (unseen_s > unseen_s.min(axis=1, keepdims=True)) & np.isfinite(unseen_s + sigma + held[..., 0])
+            known
+            & (unobserved_s > unobserved_s.min(axis=1, keepdims=True))
+            & np.isfinite(unobserved_s + sigma + held[..., 0])
         )
         average(self._past, slots, never, completed, held)
         placed = held.copy()
-        stand(never, seen, unseen_s, placed)
-        self._place_arms(never, held, completed, sigma, unseen_s, offsets, placed)
-        bridged, bridged_sigma = seen.copy(), sigma.copy()
-        _bridge(slots, occluded & seen_later, *track, bridged, bridged_sigma)
-        candidates, sigmas = (seen, completed, held, bridged), (completed_sigma, bridged_sigma)
-        weighed = self._weigh(slots, occluded, candidates, sigmas, sigma, unseen_s, seen_later)
-        share = np.clip((unseen_s[occluded] - FORGETTING_S[0]) / (FORGETTING_S[1] - FORGETTING_S[0]), 0.0, 1.0)
-        forgotten = np.hypot(weighed.sigma, share * completed_sigma[occluded])
-        between = _of_bridged(forgotten, occluded, seen_later, bridged_sigma, np.where(unseen_s == 0.0, sigma, np.nan))
+        stand(never, positions, unobserved_s, placed)
+        self._place_arms(never, held, completed, sigma, unobserved_s, offsets, placed)
+        bridged, bridged_sigma = positions.copy(), sigma.copy()
+        _bridge(slots, occluded & observed_later, *track, bridged, bridged_sigma)
+        candidates, sigmas = (positions, completed, held, bridged), (completed_sigma, bridged_sigma)
+        weighed = self._weigh(slots, occluded, candidates, sigmas, sigma, unobserved_s, observed_later)
+        share = np.interp(unobserved_s[occluded], FORGETTING_S, (0.0, 1.0))
+        deviation = np.hypot(weighed.sigma, share * completed_sigma[occluded])
+        observed_sigma = np.where(unobserved_s == 0.0, sigma, np.nan)
+        deviation = _limited_by_bridge(deviation, occluded, observed_later, bridged_sigma, observed_sigma)
         return Placed(
             np.concatenate([np.argwhere(occluded), np.argwhere(never)]),
             np.concatenate([weighed.positions, placed[never]]),
-            np.concatenate([between, (_of_unseen_parts(never) * completed_sigma)[never]]),
+            np.concatenate([deviation, (_unobserved_part_factors(never) * completed_sigma)[never]]),
         )
 
     def _place_arms(
@@ -164,16 +167,16 @@ class OccludedJoints:
         held: Floats,
         completed: Floats,
         sigma: Floats,
-        unseen_s: Floats,
+        unobserved_s: Floats,
         offsets: Floats,
         placed: Floats,
     ) -> None:
-        """Move joints of arms that were ``never`` (B, 22) observed, ``placed`` (B, 22, 3), towards their expectation
-        given the observed joints, in the Gaussian of postures."""
+        """Move the arms' joints that were ``never`` (B, 22) observed in ``placed`` (B, 22, 3), in place, towards their
+        expectation under the Gaussian of postures, given the observed joints."""
         arms = never & _OF_ARMS
         rows = np.flatnonzero(arms.any(axis=1))
         if len(rows):
-            known = np.where(unseen_s[rows] == 0.0, sigma[rows], np.inf)
+            known = np.where(unobserved_s[rows] == 0.0, sigma[rows], np.inf)
             positions = np.where(np.isfinite(held[rows]), held[rows], completed[rows])
             expected = self._posture(positions, known, np.linalg.norm(offsets[rows], axis=-1)).positions
             placed[rows] += np.where(arms[rows], POSTURE_SHARE, 0.0)[..., None] * (expected - placed[rows])
@@ -185,53 +188,55 @@ class OccludedJoints:
         candidates: tuple[Floats, ...],
         sigmas: tuple[Floats, ...],
         sigma: Floats,
-        unseen_s: Floats,
-        seen_later: Bools,
+        unobserved_s: Floats,
+        observed_later: Bools,
     ) -> Weighed:
-        # contiguous, because numba compiles a loop for each memory layout
+        # contiguous, because numba compiles a loop for every memory layout
         body, joint = (np.ascontiguousarray(index) for index in np.nonzero(occluded))
         if not len(body):
             return Weighed(np.empty((0, 3)), np.empty(0))
         chosen = np.stack([positions[body, joint] for positions in candidates], axis=1)
         deviations = np.stack([each[body, joint] for each in sigmas], axis=1)
         features = np.empty((len(body), FEATURES), dtype=np.float32)
-        _describe(self._past, slots, body, joint, chosen, deviations, sigma, unseen_s, seen_later, features)
+        _describe(self._past, slots, body, joint, chosen, deviations, sigma, unobserved_s, observed_later, features)
         return self.weigher(Occluded(body, joint, chosen, features))
 
 
-def _of_bridged(stated: Floats, occluded: Bools, seen_later: Bools, bridged: Floats, observed: Floats) -> Floats:
-    """Return the deviations (N,) of ``occluded`` (B, 22) joints, less for those that are observed again.
+def _limited_by_bridge(
+    sigma: Floats, occluded: Bools, observed_later: Bools, bridged: Floats, observed: Floats
+) -> Floats:
+    """Limit the standard deviations (N,) of ``occluded`` (B, 22) joints that are observed again within the delay.
 
-    The network's deviation, ``stated`` (N,), of a joint between two observations is twice its error. The filters'
-    deviation, ``bridged`` (B, 22), is nearer, but it omits errors that last. These count as much as in the deviations
-    of the body's ``observed`` joints (B, 22), NaN for others.
+    For these joints, the network's deviation ``sigma`` (N,) is twice the error. That of the filters, ``bridged`` (B,
+    22), is more accurate, but omits time-correlated errors. These add as much as they do to the deviations of the
+    body's ``observed`` joints (B, 22), which are NaN for other joints: their median is the lower bound.
     """
-    deviations = stated.copy()
+    limited = sigma.copy()
     for k, (row, joint) in enumerate(np.argwhere(occluded)):
         others = observed[row][np.isfinite(observed[row])]
-        if seen_later[row, joint] and len(others):
-            deviations[k] = np.fmin(stated[k], max(bridged[row, joint], median(others)))
-    return deviations
+        if observed_later[row, joint] and len(others):
+            limited[k] = np.fmin(sigma[k], max(bridged[row, joint], median(others)))
+    return limited
 
 
-def _of_unseen_parts(never: Bools) -> Floats:
-    """(B, 22) `_UNSEEN_LEG`, `_UNSEEN_ARM` or `_UNSEEN_WAIST` for joints of parts whose joints were all ``never``
-    (B, 22) observed, 1 for the others."""
+def _unobserved_part_factors(never: Bools) -> Floats:
+    """(B, 22) factors on the deviations of joints in parts whose joints were all ``never`` (B, 22) observed; 1 for
+    others."""
     factors = np.ones(never.shape)
-    factors[:, _WAIST] = np.where(never[:, _WAIST].all(axis=1), _UNSEEN_WAIST, 1.0)[:, None]
+    factors[:, _WAIST] = np.where(never[:, _WAIST].all(axis=1), _UNOBSERVED_WAIST, 1.0)[:, None]
     for leg in _LEGS:
-        factors[:, leg] = np.where(never[:, leg].all(axis=1), _UNSEEN_LEG, 1.0)[:, None]
+        factors[:, leg] = np.where(never[:, leg].all(axis=1), _UNOBSERVED_LEG, 1.0)[:, None]
     for _, *arm in _ARMS:
-        factors[:, arm] = np.where(never[:, arm].all(axis=1), _UNSEEN_ARM, 1.0)[:, None]
+        factors[:, arm] = np.where(never[:, arm].all(axis=1), _UNOBSERVED_ARM, 1.0)[:, None]
     return factors
 
 
 @njit(cache=True)
-def _bridge(slots, wanted, positions, at, noise, bridged, sigma):
+def _bridge(slots, bridgeable, positions, at, noise, bridged, sigma):
     place = np.empty(3)
     for row, slot in enumerate(slots):
-        for joint in range(wanted.shape[1]):
-            if not wanted[row, joint]:
+        for joint in range(bridgeable.shape[1]):
+            if not bridgeable[row, joint]:
                 continue
             deviation = bridge(positions[:, slot, joint], at, noise[slot], place)
             if np.isfinite(deviation):
@@ -241,10 +246,10 @@ def _bridge(slots, wanted, positions, at, noise, bridged, sigma):
 
 
 @njit(cache=True)
-def _describe(past, slots, body, joint, candidates, sigmas, sigma, unseen_s, seen_later, features):
+def _describe(past, slots, body, joint, candidates, sigmas, sigma, unobserved_s, observed_later, features):
     for row in range(len(body)):
         b, j = body[row], joint[row]
-        describe(past, slots[b], j, candidates[row], sigmas[row], sigma[b], unseen_s[b], seen_later[b, j],
+        describe(past, slots[b], j, candidates[row], sigmas[row], sigma[b], unobserved_s[b], observed_later[b, j],
                  features[row])  # fmt: skip
 
 

@@ -29,15 +29,16 @@ MEMORY, FIRST = 45, 15
 
 WINSORISED = 2.0
 """Bound at which differences are clipped before they update mean and deviation, standard deviations. A single outlier
-then has little effect, but a lasting new length is accepted within two seconds."""
+then has little effect, but a length that stays changed is accepted within two seconds."""
 
 INTACT_DEVIATIONS, INTACT = 2.0, 0.01  # largest change of length of an intact bone, standard deviations or metres
 
 TELLING = 0.03
-"""Largest standard deviation of a bone that can tell a jump from motion, as a share of the joint's prediction error."""
+"""Largest standard deviation of the length of a bone that can distinguish motion from a jump, relative to the distance
+of the joint from its prediction."""
 
 MAX_OUTLIERS = 0.5
-"""Share of impossible bones among the limbs' observed bones above which it is another body, measured anew."""
+"""Share of impossible bones among the limbs' observed bones above which the body is taken for another person's."""
 
 RECENT = 15  # number of recent frames in most of which a frozen joint must repeat itself
 SAME = 1e-6  # largest motion between two frames of a joint that repeats itself, metres
@@ -123,7 +124,7 @@ def _hold(positions, distance, mean, variance, observed, moved):
 @njit(cache=True)
 def _judge(positions, mean, variance, observed, bad):
     for row in range(len(positions)):
-        seen, outliers = 0, 0
+        judged, outliers = 0, 0
         for joint in range(1, len(PARENT)):
             off = apart(positions[row], joint, PARENT[joint]) - mean[row, joint]
             if not math.isfinite(off):
@@ -131,7 +132,7 @@ def _judge(positions, mean, variance, observed, bad):
             observed[row, joint] += 1
             count = observed[row, joint]
             if count > FIRST and _IN_LIMB[joint]:
-                seen += 1
+                judged += 1
                 deviation = max(math.sqrt(variance[row, joint]), MIN_DEVIATION)
                 bad[row, joint] = abs(off) > max(MIN_SHARE * mean[row, joint], MIN_DIFFERENCE, DEVIATIONS * deviation)
                 outliers += bad[row, joint]
@@ -139,7 +140,7 @@ def _judge(positions, mean, variance, observed, bad):
             mean[row, joint] += off / min(count, MEMORY)
             if count > 1:
                 variance[row, joint] += (off * off - variance[row, joint]) / min(count, MEMORY)
-        if outliers > MAX_OUTLIERS * seen:
+        if outliers > MAX_OUTLIERS * judged:
             bad[row] = False
             observed[row] = 0.0
             continue
@@ -164,14 +165,14 @@ def _attribute(bad):
 
 @njit(cache=True)
 def frozen_joints(positions: Floats) -> Bools:
-    """(B, 22) joints of a sensor's output (B, T, 22, 3) that the tracker lost and for which it repeats its last output;
-    NaN where it has none, and the last frames count.
+    """(B, 22) which joints of a sensor's output (B, T, 22, 3), NaN where it has none, are frozen in the last frames:
+    the tracker lost them and repeats its last output.
 
     A frozen joint repeats itself in most of the frames in which the body as a whole does not, while other joints
     jitter.
     """
     count, frames, joints, _ = positions.shape
-    found = np.zeros((count, joints), dtype=np.bool_)
+    frozen = np.zeros((count, joints), dtype=np.bool_)
     for b in range(count):
         recent = positions[b, max(frames - RECENT - 1, 0) :]
         new, repeated, most = 0, np.zeros(joints), 0
@@ -193,8 +194,8 @@ def frozen_joints(positions: Floats) -> Bools:
         limit = 0.5 * max(new, _MIN_NEW)
         if most > limit and alike <= MAX_ALIKE * coordinates and median(_noise(recent)) > MIN_NOISE:
             for joint in range(joints):
-                found[b, joint] = repeated[joint] > limit
-    return found
+                frozen[b, joint] = repeated[joint] > limit
+    return frozen
 
 
 @njit(cache=True)
@@ -206,7 +207,7 @@ def _noise(positions):
     frames, joints, _ = positions.shape
     noise = np.empty(joints)
     for joint in range(joints):
-        squares, seen = 0.0, 0
+        squares, count = 0.0, 0
         for t in range(4, frames):
             square = 0.0
             for axis in range(3):
@@ -215,6 +216,6 @@ def _noise(positions):
                 square += shaken * shaken
             if math.isfinite(square):
                 squares += square
-                seen += 3
-        noise[joint] = math.sqrt(squares / 70 / max(seen, 1))
+                count += 3
+        noise[joint] = math.sqrt(squares / 70 / max(count, 1))
     return noise

@@ -141,7 +141,7 @@ class Denoise:
         # also in a frame without any observation: otherwise the estimate would jump to the smoother's
         seen |= ~seen.any(axis=1, keepdims=True)
         # and between two observations that are close in time
-        seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < BRIEF_S)
+        seen |= history.observed_since(back) & (history.unobserved_s[-1 - back] < BRIEF_S)
         late = np.interp(back, (0, SETTLED), (LATE_NEWEST_S, LATE_S)) * FPS
         noise = np.hypot(jitter, min(back / SETTLED, 1.0) * bias_sigma)
         positions, sigma = smoothed.positions.copy(), smoothed.sigma.copy()

@@ -1,10 +1,15 @@
 """Candidates for the position of an occluded joint, the features that weigh them, and `OcclusionNet` without torch.
 
-There are four candidates. The smoother lets the joint coast, which suits a standing foot. The completion network places
-it from the rest of the body, which suits a swinging arm. The joint may keep its offset from the nearest observed joint,
-turned with the trunk, which suits a resting arm. A joint that is observed again within the delay is smoothed over the
-gap from its own observations (`bridge`). The network of `training.recipes.occlusion` weighs the four from `FEATURES`
-numbers that are invariant to the body's position and heading.
+There are four candidates:
+
+- coasting: the smoother's extrapolation, which suits a standing foot;
+- completed: the completion network's estimate from the rest of the body, which suits a swinging arm;
+- held in the body frame: the last offset from the nearest observed joint, turned with the trunk, for a resting arm;
+- bridged: the joint's own observations before and after, if it is observed again within the delay
+  (`clean.occluded.bridge`).
+
+The network of `training.recipes.occlusion` weighs them from `FEATURES` numbers that are invariant to the body's
+position and heading.
 """
 
 from __future__ import annotations
@@ -21,9 +26,7 @@ from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, load_weights
 from steadypose.prior.timing.rate import FPS
 
-CANDIDATES = 4
-"""Number of candidates: coasting, completed, held in the body frame, and bridged (coasting if not observed again)."""
-
+CANDIDATES = 4  # number of candidates in the order above; for a joint that is not observed again, the last is coasting
 FEATURES = 25  # number of features of an occluded joint
 MIN_DISTANCE = 1e-3  # offset added to distances before their logarithm is taken, metres
 MIN_SIGMA = 1e-4  # offset added to standard deviations before their logarithm is taken, metres
@@ -67,7 +70,7 @@ class Past(NamedTuple):
     """(S, 22, 3) metres, the joints of the last frame; NaN before"""
     speed: Floats
     """(S, 22) m/s, running mean of each joint's speed"""
-    speed_seen: Floats
+    speed_observed: Floats
     """(S, 22) m/s, its value when the joint was last observed"""
 
 
@@ -81,11 +84,11 @@ def new_past(slots: int) -> Past:
 def forget(past: Past, slot: Bools) -> None:
     """Reset these slots (S,)."""
     past.poses[slot] = past.place[slot] = np.nan
-    past.speed[slot] = past.speed_seen[slot] = 0.0
+    past.speed[slot] = past.speed_observed[slot] = 0.0
 
 
 @njit(cache=True)
-def observe(past, slots, positions, sigma, unseen_s, held):
+def observe(past, slots, positions, sigma, unobserved_s, held):
     """Update the state with a frame of B bodies, and write their poses with occluded joints held in the body frame.
 
     Args:
@@ -93,26 +96,28 @@ def observe(past, slots, positions, sigma, unseen_s, held):
         slots: (B,) slots of the bodies.
         positions: (B, 22, 3) metres, from the smoother; NaN for joints never observed.
         sigma: (B, 22) metres along an axis, their standard deviations.
-        unseen_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
+        unobserved_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
         held: (B, 22, 3) metres, written; NaN for joints never observed.
     """
     joints = positions.shape[1]
-    seen = np.empty(joints, dtype=np.bool_)
+    observed = np.empty(joints, dtype=np.bool_)
     for row, slot in enumerate(slots):
         for joint in range(joints):
-            seen[joint] = unseen_s[row, joint] == 0.0 and math.isfinite(positions[row, joint, 0] + sigma[row, joint])
+            observed[joint] = unobserved_s[row, joint] == 0.0 and math.isfinite(
+                positions[row, joint, 0] + sigma[row, joint]
+            )
             moved = 0.0
             for axis in range(3):
                 moved += (positions[row, joint, axis] - past.place[slot, joint, axis]) ** 2
                 past.place[slot, joint, axis] = held[row, joint, axis] = positions[row, joint, axis]
             moved = math.sqrt(moved) * FPS if math.isfinite(moved) else 0.0
             past.speed[slot, joint] += FADING * (moved - past.speed[slot, joint])
-            if seen[joint]:
-                past.speed_seen[slot, joint] = past.speed[slot, joint]
+            if observed[joint]:
+                past.speed_observed[slot, joint] = past.speed[slot, joint]
         for joint in range(joints):
-            if not seen[joint]:
-                _hold(joint, past.poses[slot, joint], positions[row], seen, held[row])
-        _keep(past.poses[slot], seen, held[row])
+            if not observed[joint]:
+                _hold_in_body_frame(joint, past.poses[slot, joint], positions[row], observed, held[row])
+        _keep(past.poses[slot], observed, held[row])
 
 
 @njit(cache=True)
@@ -138,7 +143,7 @@ def average(past, slots, never, completed, held):
 
 @njit(cache=True)
 def _keep(poses, which, held):
-    """Keep the pose ``held`` (22, 3) as the last one of these joints (22,)."""
+    """Store the pose ``held`` (22, 3) as the latest pose of the joints ``which`` (22,)."""
     for joint in range(len(which)):
         if which[joint]:
             for other in range(len(which)):
@@ -147,34 +152,34 @@ def _keep(poses, which, held):
 
 
 @njit(cache=True)
-def stand(never, positions, unseen_s, placed):
+def stand(never, positions, unobserved_s, placed):
     """Move joints that were never observed towards their positions in a standing adult, in place.
 
     Args:
         never: (B, 22) which joints were never observed.
         positions: (B, 22, 3) metres, from the smoother.
-        unseen_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
+        unobserved_s: (B, 22) seconds since each joint was last observed; 0 for an observed joint.
         placed: (B, 22, 3) metres, mean completed positions of these joints, changed; other joints do not change.
     """
     joints = never.shape[1]
-    seen, standing = np.empty(joints, dtype=np.bool_), np.empty((joints, 3))
+    observed, standing = np.empty(joints, dtype=np.bool_), np.empty((joints, 3))
     for row in range(len(never)):
         for joint in range(joints):
-            seen[joint] = unseen_s[row, joint] == 0.0 and math.isfinite(positions[row, joint, 0])
+            observed[joint] = unobserved_s[row, joint] == 0.0 and math.isfinite(positions[row, joint, 0])
         for joint in range(joints):
-            if never[row, joint] and seen.any():
-                _hold(joint, STANDING, positions[row], seen, standing)
+            if never[row, joint] and observed.any():
+                _hold_in_body_frame(joint, STANDING, positions[row], observed, standing)
                 for axis in range(3):
                     placed[row, joint, axis] += STANDING_SHARE * (standing[joint, axis] - placed[row, joint, axis])
 
 
 @njit(cache=True)
-def _hold(joint, then, positions, seen, held):
+def _hold_in_body_frame(joint, then, positions, observed, held):
     """Write a joint at its offset from the nearest observed joint in the pose ``then`` (22, 3), turned with the
     trunk."""
     nearest, least = -1, np.inf
-    for other in range(len(seen)):
-        if seen[other]:
+    for other in range(len(observed)):
+        if observed[other]:
             square = 0.0
             for axis in range(3):
                 square += (then[joint, axis] - then[other, axis]) ** 2
@@ -185,7 +190,7 @@ def _hold(joint, then, positions, seen, held):
         for axis in range(3):
             held[joint, axis] = then[joint, axis]
         return
-    angle = turned(then, positions, seen)
+    angle = turned(then, positions, observed)
     cosine, sine = math.cos(angle), math.sin(angle)
     x, y = then[joint, 0] - then[nearest, 0], then[joint, 1] - then[nearest, 1]
     held[joint, 0] = positions[nearest, 0] + cosine * x - sine * y
@@ -194,12 +199,12 @@ def _hold(joint, then, positions, seen, held):
 
 
 @njit(cache=True)
-def turned(then, now, seen):
+def turned(then, now, observed):
     """Angle about z from pose ``then`` to ``now`` (22, 3), radians, from the observed hips and shoulders."""
     a, b = np.zeros(2), np.zeros(2)
     for part in range(len(_TRUNK)):
         left, right = _TRUNK[part]
-        if seen[left] and seen[right] and math.isfinite(then[left, 0] + then[right, 0]):
+        if observed[left] and observed[right] and math.isfinite(then[left, 0] + then[right, 0]):
             for axis in range(2):
                 a[axis] += then[left, axis] - then[right, axis]
                 b[axis] += now[left, axis] - now[right, axis]
@@ -208,7 +213,7 @@ def turned(then, now, seen):
 
 
 @njit(cache=True)
-def describe(past, slot, joint, candidates, sigmas, sigma, unseen_s, seen_later, features):
+def describe(past, slot, joint, candidates, sigmas, sigma, unobserved_s, observed_later, features):
     """Write the features (`FEATURES`,) of an occluded joint. Call it after `observe` with the same frame.
 
     Args:
@@ -218,8 +223,8 @@ def describe(past, slot, joint, candidates, sigmas, sigma, unseen_s, seen_later,
         candidates: (4, 3) metres, in the order of `CANDIDATES`.
         sigmas: (2,) metres, standard deviations of the completed and the bridged position.
         sigma: (22,) metres, standard deviations of the smoother.
-        unseen_s: (22,) seconds since each joint was last observed.
-        seen_later: whether the joint is observed again within the delay.
+        unobserved_s: (22,) seconds since each joint was last observed.
+        observed_later: whether the joint is observed again within the delay.
         features: (`FEATURES`,) float32, written.
     """
     place, then = past.place[slot], past.poses[slot, joint]
@@ -228,23 +233,23 @@ def describe(past, slot, joint, candidates, sigmas, sigma, unseen_s, seen_later,
     known = np.empty(joints, dtype=np.bool_)
     for other in range(joints):
         known[other] = math.isfinite(place[other, 0])
-        if unseen_s[other] == 0.0 and math.isfinite(sigma[other]):
+        if unobserved_s[other] == 0.0 and math.isfinite(sigma[other]):
             speed += past.speed[slot, other]
             noise += sigma[other]
             count += 1
         if then[other, 2] < lowest:
             lowest = then[other, 2]
     speed, noise = speed / max(count, 1), noise / max(count, 1)
-    features[0] = math.log(unseen_s[joint] * FPS)
-    features[1] = 1.0 if seen_later else 0.0
+    features[0] = math.log(unobserved_s[joint] * FPS)
+    features[1] = 1.0 if observed_later else 0.0
     features[2] = math.log(sigma[joint] + MIN_SIGMA)
     features[3] = _log_apart(then[0], place[0])
     features[4] = abs(turned(then, place, known))
     features[5] = math.log(speed + MIN_SPEED)
-    features[6] = math.log(past.speed_seen[slot, joint] + MIN_SPEED)
+    features[6] = math.log(past.speed_observed[slot, joint] + MIN_SPEED)
     features[7] = 1.0 - count / joints
-    features[8] = 1.0 if unseen_s[_PARENT[joint]] > 0.0 else 0.0
-    features[9] = 1.0 if unseen_s[_MIRROR[joint]] > 0.0 else 0.0
+    features[8] = 1.0 if unobserved_s[_PARENT[joint]] > 0.0 else 0.0
+    features[9] = 1.0 if unobserved_s[_MIRROR[joint]] > 0.0 else 0.0
     features[10] = math.log(noise + MIN_SIGMA)
     features[11] = math.log(max(then[joint, 2] - lowest, 0.0) + MIN_HEIGHT)
     features[12] = 0.0 if not math.isfinite(then[0, 2] + place[0, 2]) else place[0, 2] - then[0, 2]

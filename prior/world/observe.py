@@ -174,7 +174,7 @@ class LegMemory:
     """Time for which one body's knees and feet have been unobserved; a new body's were never observed."""
 
     def __init__(self) -> None:
-        self._unseen_s = np.full(len(_JOINTS), np.inf)
+        self._unobserved_s = np.full(len(_JOINTS), np.inf)
 
     def update(self, observed: BodyObservation) -> Bools:
         """Return which joints of legs (6,), in the order of `LEG_CONTACTS`, are only guesses.
@@ -184,5 +184,5 @@ class LegMemory:
         """
         knees, *feet = observed.observed[_JOINTS].reshape(3, 2)
         foot = np.any(feet, axis=0)
-        self._unseen_s = np.where([*(knees | foot), *foot, *foot], 0.0, self._unseen_s + observed.dt)
-        return self._unseen_s >= GUESSED_S
+        self._unobserved_s = np.where([*(knees | foot), *foot, *foot], 0.0, self._unobserved_s + observed.dt)
+        return self._unobserved_s >= GUESSED_S

@@ -88,7 +88,7 @@ def test_denoising_weighs_two_estimates_of_which_one_has_part_of_the_others_nois
         found = stage._denoised(smoothed, history, jitter, bias, back)
         seen = np.isfinite(history.positions[-1 - back][..., 0])
         seen |= ~seen.any(axis=1, keepdims=True)
-        seen |= history.seen_since(back) & (history.unseen_s[-1 - back] < reconstruct.BRIEF_S)
+        seen |= history.observed_since(back) & (history.unobserved_s[-1 - back] < reconstruct.BRIEF_S)
         moved = stage._reconstructed[-1 - back] - frame
         square = np.square(moved).mean(axis=-1)
         positions, sigmas = frame.copy(), smoothed.sigma.copy()

@@ -49,7 +49,7 @@ class MixtureSmoother:
     Attributes:
         delay: look-ahead, frames.
         white: (S,) share of each body's noise that is white, estimated up to the newest frame.
-        lasting: (S,) certainty that it lasts instead.
+        correlated: (S,) certainty that this noise is time-correlated, 0 to 1.
     """
 
     def __init__(self, delay: int, slots: int, weights: str = "default") -> None:
@@ -62,7 +62,7 @@ class MixtureSmoother:
         self._memory = _Memory(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
         self._bank = new_bank(slots, delay)
         self._whiteness = Whiteness(slots, delay)
-        self.white, self.lasting = np.zeros(slots), self._whiteness.lasting
+        self.white, self.correlated = np.zeros(slots), self._whiteness.correlated
         self._covariance = body_covariance()
         self._experts = np.empty((slots, 22, EXPERTS, 3))
         self._features = np.empty((slots, 22, FEATURES), dtype=np.float32)
@@ -78,7 +78,7 @@ class MixtureSmoother:
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)
-        self.white, self.lasting = self._whiteness.share(positions), self._whiteness.lasting
+        self.white, self.correlated = self._whiteness.share(positions), self._whiteness.correlated
         advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
         return self._answer(self.delay) if self._count > self.delay else None
 

@@ -1,9 +1,9 @@
-"""Estimates the whiteness of a sensor's noise from bone lengths, which no motion changes, and selects the estimate by
-it.
+"""Estimates the whiteness of a sensor's noise from bone lengths, which no motion changes. It determines the weight of
+the multiple-model estimate.
 
-The network's weights were learned from the motion of a few people. In white noise, no weights are better than the
-innovations' likelihoods, whoever moves, so the multiple-model estimate replaces the network's. Time-correlated noise,
-which real sensors have, misleads the multiple-model estimate, so the learned weights stay.
+In white noise, no weights are better than the likelihoods of the innovations, so the multiple-model estimate replaces
+the network's, whose weights were learned from the motion of a few people. Time-correlated noise, which real sensors
+have, misleads the multiple-model estimate, so the learned weights stay.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ multiple-model estimate."""
 
 SHARE = 1.5
 """Factor from the squared whiteness to the white share of the noise, which is at most 1. On validation people, the
-whiteness is 0.95 in independent noise, 0.5 in depth errors that last for 0.05 s, and 0 to 0.1 for a Kinect, for
-MediaPipe and in noise with a correlation time of half a second."""
+whiteness is 0.95 in independent noise, 0.5 in depth errors with a correlation time of 0.05 s, and 0 to 0.1 for a
+Kinect, for MediaPipe and in noise with a correlation time of half a second."""
 
 OWN = 3e-3
 """Standard deviation of slow variations of a bone's length that are not attributed to the sensor, metres. Joints
 computed from skin markers are not ends of rigid bones: in UI-PRMD, lengths vary by 2.5 mm (median)."""
 
 CERTAIN = 1.25
-"""Factor on the share of the noise that is not white; with a white share of a fifth or less, all of it lasts."""
+"""Factor from the share of the noise that is not white to the certainty that the noise is time-correlated, which is
+thus 1 for a white share of a fifth or less."""
 
 LARGE, LARGE_NEWEST = 0.014, 0.01
 """White noise along an axis in which the weight of the multiple-model estimate is at most three quarters, metres; the
@@ -49,19 +50,19 @@ class Whiteness:
 
     In white noise, half the mean squared change equals the variance (von Neumann's ratio, 1941), and the next change
     undoes half of each change. In noise with a correlation of r from frame to frame, both ratios are 1 - r. Slow
-    variations increase only the variance and lower the first ratio. Motion seen by a sensor that smooths lowers the
-    second ratio. The whiteness is the smaller of the two.
+    variations increase only the variance, and so lower the first ratio. If the sensor smooths, motion lowers the second
+    ratio. The whiteness is the smaller of the two.
 
     Args:
         slots: number of bodies.
         delay: look-ahead of the smoother, frames.
 
     Attributes:
-        lasting: (S,) certainty that the noise is not white but lasts, from 0 at the start to 1.
+        correlated: (S,) certainty that the noise is time-correlated, 0 (at the start) to 1.
     """
 
     def __init__(self, slots: int, delay: int) -> None:
-        self.lasting = np.zeros(slots)
+        self.correlated = np.zeros(slots)
         self._start = START if delay else START_NEWEST
         self._last, self._step = np.full((2, slots, _BONES), np.nan)
         self._frames, self._mean, self._variance, self._change = np.zeros((4, slots, _BONES))
@@ -82,8 +83,8 @@ class Whiteness:
             self._undone, white,
         )  # fmt: skip
         frames = self._frames.max(axis=1)
-        lasting = np.minimum(CERTAIN * (1.0 - np.minimum(SHARE * white**2, 1.0)), 1.0)
-        self.lasting = lasting * frames / (frames + START_NEWEST)
+        correlated = np.minimum(CERTAIN * (1.0 - np.minimum(SHARE * white**2, 1.0)), 1.0)
+        self.correlated = correlated * frames / (frames + START_NEWEST)
         return np.minimum(SHARE * (white * frames / (frames + self._start)) ** 2, 1.0)
 
 

@@ -240,19 +240,19 @@ def test_what_goes_out_keeps_its_promises_whatever_comes_in(frames: list[PoseRaw
     check_promises(outputs(frames)[0])
 
 
-KILLED, LASTING = CONTEXT + 50, CONTEXT + 100
+KILLED, ACCEPT_AFTER = CONTEXT + 50, CONTEXT + 100
 
 
 def positions(messages: list[PoseClean] | list[PoseWorld]) -> NDArray[np.float32]:
-    """(LASTING - KILLED - 10, 22, 3) metres, from the kill on."""
+    """(ACCEPT_AFTER - KILLED - 10, 22, 3) metres, from the kill on."""
     end = messages[-1].stamp_ns - round(10 / 30 * 1e9)
-    begin = end - round((LASTING - KILLED - 10) / 30 * 1e9)
+    begin = end - round((ACCEPT_AFTER - KILLED - 10) / 30 * 1e9)
     return np.array([m.bodies[0].positions for m in messages if begin < m.stamp_ns + 1000 <= end + 2000])
 
 
 @pytest.mark.slow
 def test_who_begins_anew_is_a_little_off_and_no_worse() -> None:
-    frames = walk(LASTING)
+    frames = walk(ACCEPT_AFTER)
 
     def cleaned(given: list[PoseRaw]) -> list[PoseClean]:
         pipeline = PriorPipeline(PriorSettings())

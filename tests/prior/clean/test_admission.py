@@ -10,7 +10,7 @@ from tests.helpers.bodies import raw, stream, waving
 from tests.helpers.values import clean
 
 from steadypose.msgs.types import PoseClean, PoseRaw
-from steadypose.prior.clean.admission import LASTING, StampGate
+from steadypose.prior.clean.admission import ACCEPT_AFTER, StampGate
 from steadypose.prior.clean.batch import StreamBatch
 from steadypose.prior.clean.pipeline import BACKWARDS_NS
 from steadypose.prior.clean.settings import PriorSettings
@@ -53,12 +53,13 @@ def test_a_clock_that_was_set_loses_no_frame(frames: list[PoseRaw], shift_ns: in
 
 def test_a_stream_that_ends_within_the_jump_is_answered(frames: list[PoseRaw]) -> None:
     late = [
-        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS) for frame in frames[12 : 12 + LASTING - 1]
+        dataclasses.replace(frame, stamp_ns=frame.stamp_ns + 3 * SECOND_NS)
+        for frame in frames[12 : 12 + ACCEPT_AFTER - 1]
     ]
-    assert len(clean([*frames[:12], *late], **SIMPLE)[0]) == 12 + LASTING - 1
+    assert len(clean([*frames[:12], *late], **SIMPLE)[0]) == 12 + ACCEPT_AFTER - 1
     end = dataclasses.replace(late[-1], bodies=[], end_of_stream=True)
     found, _ = clean([*frames[:12], *late, end], **SIMPLE)
-    assert len(found) == 12 + LASTING
+    assert len(found) == 12 + ACCEPT_AFTER
     assert found[-1].end_of_stream
 
 

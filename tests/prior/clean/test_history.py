@@ -30,8 +30,8 @@ def test_frames_lost_whole_are_a_straight_line_if_they_are_few(lost: int) -> Non
     else:
         np.testing.assert_allclose(got, line, atol=1e-12)
     assert np.isnan(history.observed[-lost - 1 : -1]).all()
-    assert history.unseen_s[-2].min() == pytest.approx(lost / 30)
-    assert (history.unseen_s[-1] == 0).all()
+    assert history.unobserved_s[-2].min() == pytest.approx(lost / 30)
+    assert (history.unobserved_s[-1] == 0).all()
 
 
 def test_a_body_of_which_a_joint_is_left_is_not_filled_in() -> None:
@@ -46,7 +46,7 @@ def test_forgetting_a_slot_leaves_the_others() -> None:
     history.forget(np.array([False, True, False]))
     np.testing.assert_array_equal(history.positions[-4:, [0, 2]], seen[:, [0, 2]])
     assert np.isnan(history.positions[:, 1]).all()
-    assert np.isinf(history.unseen_s[:, 1]).all()
+    assert np.isinf(history.unobserved_s[:, 1]).all()
     assert (history.confidence[:, 1] == 0).all()
     history.append(gated(seen[0]))  # who comes next was not lost a moment ago
     assert np.isnan(history.positions[-2, 1]).all()
@@ -55,7 +55,7 @@ def test_forgetting_a_slot_leaves_the_others() -> None:
 def test_a_joint_never_seen_is_unseen_for_ever() -> None:
     seen = positions(3)
     seen[:, 0, 5] = np.nan
-    assert np.isinf(filled(seen).unseen_s[-1, 0, 5])
+    assert np.isinf(filled(seen).unobserved_s[-1, 0, 5])
 
 
 @given(st.integers(1, 9), st.lists(st.floats(-9, 9), max_size=40))

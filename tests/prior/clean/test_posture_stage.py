@@ -49,8 +49,8 @@ def test_joints_move_a_share_of_the_way_and_in_white_noise_those_observed_are_th
 def test_in_little_white_noise_joints_hardly_move_however_unsure_the_smoother_is() -> None:
     before = estimate(REST_POSITIONS + np.random.default_rng(2).normal(0.0, 0.02, (1, 22, 3)), 0.03)
     little = np.array([0.2 * LITTLE / AT_MOST])
-    for lasting, low, high in ((0.0, 0.0, 0.001), (1.0, 0.005, 0.1)):
-        after = Posture(PostureSettings()).update(before, LENGTHS, little, np.array([lasting]))
+    for correlated, low, high in ((0.0, 0.0, 0.001), (1.0, 0.005, 0.1)):
+        after = Posture(PostureSettings()).update(before, LENGTHS, little, np.array([correlated]))
         assert low < np.linalg.norm(after.positions - before.positions, axis=-1).max() < high
 
 
@@ -98,9 +98,9 @@ SPINES, COLLARS = [J["spine1"], J["spine2"]], [J["left_collar"], J["right_collar
 
 
 def test_joints_that_a_kinect_lacks_are_means_of_its_own_in_the_body_that_lacks_them_alone() -> None:
-    given, unseen_s = estimate(RNG.normal(size=(2, 22, 3))), np.zeros((2, 22))
-    unseen_s[1, SPINES + COLLARS] = np.inf
-    mixed = mix(given, unseen_s)
+    given, unobserved_s = estimate(RNG.normal(size=(2, 22, 3))), np.zeros((2, 22))
+    unobserved_s[1, SPINES + COLLARS] = np.inf
+    mixed = mix(given, unobserved_s)
     p = given.positions[1]
     np.testing.assert_allclose(mixed.positions[1, J["spine2"]], 0.2 * p[J["pelvis"]] + 0.8 * p[J["spine3"]])
     collar = 0.333 * p[J["spine3"]] + 0.278 * p[J["neck"]] + 0.389 * p[J["right_shoulder"]]
@@ -114,14 +114,14 @@ def test_joints_that_a_kinect_lacks_are_means_of_its_own_in_the_body_that_lacks_
 
 
 def test_a_spine_between_joints_that_are_unknown_too_follows_from_rotations() -> None:
-    given, unseen_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
-    unseen_s[0, [*SPINES, *COLLARS, J["spine3"]]] = np.inf
-    mixed = mix(given, unseen_s)
+    given, unobserved_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
+    unobserved_s[0, [*SPINES, *COLLARS, J["spine3"]]] = np.inf
+    mixed = mix(given, unobserved_s)
     np.testing.assert_array_equal(mixed.positions[0, SPINES], given.positions[0, SPINES])
     assert (mixed.positions[0, COLLARS] != given.positions[0, COLLARS]).all()
 
 
 def test_a_joint_that_is_hidden_for_a_while_is_no_mixture() -> None:
-    given, unseen_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
-    unseen_s[0, SPINES + COLLARS] = 3.0
-    assert mix(given, unseen_s) is given
+    given, unobserved_s = estimate(RNG.normal(size=(1, 22, 3))), np.zeros((1, 22))
+    unobserved_s[0, SPINES + COLLARS] = 3.0
+    assert mix(given, unobserved_s) is given

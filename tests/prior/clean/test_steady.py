@@ -18,9 +18,11 @@ def _moving(t: int, off: float = 0.0) -> np.ndarray:
     return np.array(REST_POSITIONS)[None] + t * STEP + off
 
 
-def _updated(steady: Steady, frame: Estimate, step: np.ndarray | None = STEP, apart: float = 0.1, lasting: float = 0.0):
+def _updated(
+    steady: Steady, frame: Estimate, step: np.ndarray | None = STEP, apart: float = 0.1, correlated: float = 0.0
+):
     """The positions of a frame whose joints were observed ``apart`` metres from their estimates."""
-    return steady.update(frame, step, frame.positions + [apart, 0.0, 0.0], np.array([lasting])).positions
+    return steady.update(frame, step, frame.positions + [apart, 0.0, 0.0], np.array([correlated])).positions
 
 
 def test_estimates_that_alternate_about_a_motion_alternate_by_less_and_do_not_lag() -> None:
@@ -51,48 +53,48 @@ def test_only_joints_observed_in_both_frames_are_blended() -> None:
 
 def test_without_a_later_frame_or_a_past_estimates_stay() -> None:
     steady, frame = Steady(1, 0), estimate(_moving(1, 0.01))
-    _updated(steady, estimate(_moving(0)), None, lasting=1.0)
-    np.testing.assert_array_equal(_updated(steady, frame, lasting=1.0), frame.positions)
+    _updated(steady, estimate(_moving(0)), None, correlated=1.0)
+    np.testing.assert_array_equal(_updated(steady, frame, correlated=1.0), frame.positions)
     steady.forget(np.ones(1, dtype=bool))
-    np.testing.assert_array_equal(_updated(steady, estimate(_moving(2)), lasting=1.0), _moving(2))
+    np.testing.assert_array_equal(_updated(steady, estimate(_moving(2)), correlated=1.0), _moving(2))
 
 
-def _straightened(off: float, apart: float, lasting: float, delay: int = LOOK_AHEAD) -> float:
+def _straightened(off: float, apart: float, correlated: float, delay: int = LOOK_AHEAD) -> float:
     """How far a joint comes nearer to its straight path, off which it is in one frame after two seconds on it."""
     steady = Steady(1, delay)
     for t in range(60):
-        _updated(steady, estimate(_moving(t)), apart=apart, lasting=lasting)
+        _updated(steady, estimate(_moving(t)), apart=apart, correlated=correlated)
     jump = estimate(_moving(60, off))
-    moved = _updated(steady, jump, apart=apart, lasting=lasting) - jump.positions
+    moved = _updated(steady, jump, apart=apart, correlated=correlated) - jump.positions
     return float(np.linalg.norm(moved, axis=-1).mean() - SHARE * np.sqrt(3) * off)
 
 
 def test_where_noise_lasts_a_joint_goes_to_the_middle_of_its_neighbours_in_time() -> None:
     # its step leads on from where it is, so the middle is half of what the blend left
     middle = 0.5 * (1 - SHARE) * np.sqrt(3) * 1e-4
-    assert _straightened(1e-4, apart=0.1, lasting=1.0) == pytest.approx(middle, rel=1e-3)
-    assert _straightened(1e-4, apart=0.1, lasting=0.0) == pytest.approx(0.0, abs=1e-12)
-    assert _straightened(1e-4, apart=0.1, lasting=1.0, delay=LOOK_AHEAD - 1) == pytest.approx(0.0, abs=1e-12)
+    assert _straightened(1e-4, apart=0.1, correlated=1.0) == pytest.approx(middle, rel=1e-3)
+    assert _straightened(1e-4, apart=0.1, correlated=0.0) == pytest.approx(0.0, abs=1e-12)
+    assert _straightened(1e-4, apart=0.1, correlated=1.0, delay=LOOK_AHEAD - 1) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(("apart", "lasting"), [(0.01, 1.0), (0.01, 0.5), (0.001, 1.0)])
-def test_how_far_is_limited_by_how_far_estimates_lie_from_observations(apart: float, lasting: float) -> None:
+@pytest.mark.parametrize(("apart", "correlated"), [(0.01, 1.0), (0.01, 0.5), (0.001, 1.0)])
+def test_how_far_is_limited_by_how_far_estimates_lie_from_observations(apart: float, correlated: float) -> None:
     off, forgotten = 0.05, 1 - 1 / (MEMORY_S * FPS)
     last = np.linalg.norm(SHARE * off * np.ones(3) + [apart, 0.0, 0.0])
     distance = forgotten * (1 - forgotten**60) * apart + (1 - forgotten) * last
     middle = 0.5 * (1 - SHARE) * np.sqrt(3) * off
     speed = 0.5 * FPS * np.sqrt(3) * (2 * STEP[0, 0, 0] + (1 - SHARE) * off)
-    most = STRAIGHTEN * lasting * distance / (1 + (speed / FAST) ** 2)
-    assert _straightened(off, apart, lasting) == pytest.approx(most * middle / np.hypot(middle, most), rel=1e-6)
+    most = STRAIGHTEN * correlated * distance / (1 + (speed / FAST) ** 2)
+    assert _straightened(off, apart, correlated) == pytest.approx(most * middle / np.hypot(middle, most), rel=1e-6)
 
 
 def test_a_body_that_was_forgotten_has_no_distance_to_its_observations() -> None:
     steady = Steady(1, 4)
     for t in range(30):
-        _updated(steady, estimate(_moving(t)), lasting=1.0)
+        _updated(steady, estimate(_moving(t)), correlated=1.0)
     steady.forget(np.ones(1, dtype=bool))
-    _updated(steady, estimate(_moving(0)), apart=0.0, lasting=1.0)
-    off = _updated(steady, estimate(_moving(1, 1e-3)), apart=0.0, lasting=1.0) - _moving(1, 1e-3)
+    _updated(steady, estimate(_moving(0)), apart=0.0, correlated=1.0)
+    off = _updated(steady, estimate(_moving(1, 1e-3)), apart=0.0, correlated=1.0) - _moving(1, 1e-3)
     np.testing.assert_allclose(off, -SHARE * 1e-3, atol=2e-4)
 
 

@@ -55,7 +55,7 @@ def test_that_noise_lasts_is_not_certain_at_first() -> None:
         whiteness, certain = Whiteness(1, 4), []
         for frame in truth + lasting(truth.shape, seconds):
             whiteness.share(frame[None])
-            certain.append(whiteness.lasting[0])
+            certain.append(whiteness.correlated[0])
         assert certain[0] < 0.1
         assert high - 0.25 < certain[-1] <= high
 
