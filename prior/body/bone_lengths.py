@@ -48,10 +48,8 @@ _COLLAR_TO_SHOULDER = SHOULDERS[0] - COLLARS[0]
 class BoneEstimate(NamedTuple):
     """A person's bones."""
 
-    offsets: Floats
-    """(22, 3) metres, each joint in its parent's frame"""
-    length_variance: Floats
-    """(22,) metres^2, the part of each bone length's variance that more samples will remove"""
+    offsets: Floats  # (22, 3) metres, each joint in its parent's frame
+    length_variance: Floats  # (22,) metres^2, the part of each bone length's variance that more samples will remove
 
 
 def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, samples: int) -> BoneEstimate:

@@ -97,12 +97,9 @@ _RIGHT_NAME: Mapping[str, str] = {"mouth_left": "mouth_right", "LCollar": "RColl
 class Mount:
     """A sensor's J joints on the canonical body."""
 
-    joint: NDArray[np.intp]
-    """(J,) index of the canonical joint to which each joint is fixed"""
-    place: Floats
-    """(J, 3) metres, position in that joint's frame for a stature of 1.72 m"""
-    mirror: NDArray[np.intp]
-    """(J,) index of each joint's counterpart on the other side"""
+    joint: NDArray[np.intp]  # (J,) index of the canonical joint to which each joint is fixed
+    place: Floats  # (J, 3) metres, position in that joint's frame for a stature of 1.72 m
+    mirror: NDArray[np.intp]  # (J,) index of each joint's counterpart on the other side
 
     def positions(self, joints: Floats, orientations: Floats, scale: float) -> Floats:
         """(..., J, 3) metres, from canonical joints (..., 22, 3), their world orientations, and stature / 1.72 m."""

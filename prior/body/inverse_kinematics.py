@@ -157,8 +157,7 @@ def fit_lengths(
 
 def place_joints(rotations: NDArray[np.floating], offsets: NDArray[np.floating]) -> Floats:
     """Forward kinematics without gradients: positions (..., 22, 3) metres, with the root at the origin, of local
-    rotations (..., 22, 3, 3) and offsets (22, 3) or (..., 22, 3) metres.
-    """
+    rotations (..., 22, 3, 3) and offsets (22, 3) or (..., 22, 3) metres."""
     bones = _frames(offsets, shape := np.shape(rotations)[:-1])
     placed = np.empty_like(bones)
     _place(np.array(rotations, dtype=np.float64, order="C").reshape(*bones.shape, 3), bones, placed)

@@ -152,10 +152,8 @@ def rotation_matrices(q: Floats) -> Floats:
 class SensorFrame(NamedTuple):
     """The pose of a sensor in the world."""
 
-    rotation: Floats
-    """(3, 3) from the sensor's frame to the world's"""
-    origin: Floats
-    """(3,) metres, position of the sensor"""
+    rotation: Floats  # (3, 3) from the sensor's frame to the world's
+    origin: Floats  # (3,) metres, position of the sensor
 
     @classmethod
     def of(cls, pose: Pose) -> SensorFrame:

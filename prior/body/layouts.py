@@ -110,8 +110,7 @@ def middles(ends: Mapping[str, str]) -> dict[str, dict[str, float]]:
 
 def add_layouts(descriptions: Mapping[str, Any]) -> None:
     """Register layouts by name in this process, of the table ``skeletons`` of a TOML file. Raises ValueError if a
-    description is invalid, or its name is already taken.
-    """
+    description is invalid, or its name is already taken."""
     for name, description in descriptions.items():
         skeleton = _described(name, description)
         if _SKELETONS.setdefault(name, skeleton) != skeleton:

@@ -60,8 +60,7 @@ class Likeness:
 
 def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | None:
     """Measure how well joints (T, J, 3), of any unit and frame and NaN where missing, fit a human body in the order of
-    a layout of J joints. None if too few joints were observed.
-    """
+    a layout of J joints. None if too few joints were observed."""
     joints, _ = to_canonical(skeleton, positions.astype(np.float64))
     lengths = np.linalg.norm(joints[:, SPANS[:, 0]] - joints[:, SPANS[:, 1]], axis=-1)
     seen = np.isfinite(lengths).sum(axis=0) > len(lengths) / 4
@@ -102,8 +101,7 @@ class Stance:
 
 def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None:
     """Estimate the up axis and handedness of joints (T, J, 3) in a layout of J joints, of any unit, NaN where missing.
-    None if it is impossible, or if the up axis changes.
-    """
+    None if it is impossible, or if the up axis changes."""
     positions = positions.astype(np.float64)
     joints, _ = to_canonical(skeleton, positions)
     low = _mean(joints, "left_ankle", "right_ankle", "left_hip", "right_hip", "left_knee", "right_knee")

@@ -89,12 +89,9 @@ def mirror_names(names: Sequence[str]) -> dict[str, str]:
 class Tree:
     """A file's skeleton."""
 
-    joints: Sequence[str]
-    """J names, parents first"""
-    parents: Sequence[int]
-    """index of each joint's parent; -1 for a root"""
-    offsets: Floats
-    """(J, 3) offsets from the parent, in the file's unit"""
+    joints: Sequence[str]  # J names, parents first
+    parents: Sequence[int]  # index of each joint's parent; -1 for a root
+    offsets: Floats  # (J, 3) offsets from the parent, in the file's unit
 
     @cached_property
     def rest(self) -> Floats:
@@ -169,8 +166,7 @@ def recognise(tree: Tree) -> Rig:
 
 def up_axis(bodies: Floats) -> str:
     """Return the axis that points up in a file's joints (T, 22, 3), NaN where missing: ``y``, ``-y`` or ``z``, along
-    which heads are farthest from ankles or, if a file lacks these, shoulders from hips.
-    """
+    which heads are farthest from ankles or, if a file lacks these, shoulders from hips."""
     known = np.array([[0.0, 1.0, 0.0]])
     for high, low in (([J["head"]], [J["left_ankle"], J["right_ankle"]]), (list(SHOULDERS), list(HIPS))):
         upwards = bodies[:, high].mean(axis=1) - bodies[:, low].mean(axis=1)
@@ -185,8 +181,7 @@ def skeleton(
     name: str, middle: Mapping[str, str | Mixture], left: Mapping[str, str | Mixture], to_right: Callable[[str], str]
 ) -> Skeleton:
     """Build a skeleton from its canonical joints of the ``middle`` and of the ``left`` side, named without the side.
-    ``to_right`` maps a joint of the file's left to the right; other joints stay the same.
-    """
+    ``to_right`` maps a joint of the file's left to the right; other joints stay the same."""
     table = {joint: _weights(source) for joint, source in middle.items()}
     for joint, source in left.items():
         table[f"left_{joint}"] = _weights(source)

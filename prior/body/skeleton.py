@@ -112,8 +112,7 @@ def finite_joints(positions: NDArray[np.floating]) -> Bools:
 
 def at_origin(joints: NDArray[np.floating]) -> bool:
     """Whether bodies (T, 22, 3) metres, NaN where unknown, stay with their pelvis, or the middle of their hips, at the
-    origin. MediaPipe's hips are up to 1 mm away.
-    """
+    origin. MediaPipe's hips are up to 1 mm away."""
     roots = np.stack([joints[:, J["pelvis"]], joints[:, list(HIPS)].mean(axis=1)])
     return bool((np.fmax.reduce(np.abs(roots), axis=(1, 2), initial=np.nan) < 3e-3).any())
 

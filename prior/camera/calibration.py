@@ -89,26 +89,19 @@ class Board:
 class Corners:
     """The board's corners in an image."""
 
-    board: Floats
-    """(N, 3) metres, in the world of a board that lies flat"""
-    image: Floats
-    """(N, 2) pixels"""
+    board: Floats  # (N, 3) metres, in the world of a board that lies flat
+    image: Floats  # (N, 2) pixels
 
 
 @dataclass(frozen=True)
 class Intrinsics:
     """Intrinsics of a camera, in OpenCV's convention."""
 
-    size: tuple[int, int]
-    """pixels, width and height of the images"""
-    focal: tuple[float, float]
-    """(fx, fy) pixels"""
-    centre: tuple[float, float]
-    """(cx, cy) pixels"""
-    distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2, k3 of the Brown-Conrady model; empty for none"""
-    error_px: float = field(default=0.0, compare=False)
-    """root mean square reprojection error"""
+    size: tuple[int, int]  # pixels, width and height of the images
+    focal: tuple[float, float]  # (fx, fy) pixels
+    centre: tuple[float, float]  # (cx, cy) pixels
+    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 of the Brown-Conrady model; empty for none
+    error_px: float = field(default=0.0, compare=False)  # root mean square reprojection error
 
     @property
     def matrix(self) -> Floats:

@@ -132,8 +132,7 @@ class _View:
 
     depth: NDArray[Any]
     intrinsics: Floats
-    unprojection: Floats
-    """(3, 3) the inverse of the intrinsics"""
+    unprojection: Floats  # (3, 3) the inverse of the intrinsics
 
     def sample(self, pixels: Floats) -> Floats:
         """Metres of depth at the pixels (..., 2) nearest to these; NaN in holes, outside, and at NaN."""
@@ -205,16 +204,11 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
 class _Hips:
     """The root: the midpoint of the hips, which determines both hips."""
 
-    middle: Floats
-    """(3,) metres"""
-    trunk: float
-    """metres, middle of the shoulders to middle of the hips"""
-    rays: Floats
-    """(2, 3) through the left and the right hip"""
-    beside: float
-    """metres from hip to hip across the line of sight"""
-    measured: float
-    """metres by which the left hip's skin is farther; NaN where either is not seen"""
+    middle: Floats  # (3,) metres
+    trunk: float  # metres, middle of the shoulders to middle of the hips
+    rays: Floats  # (2, 3) through the left and the right hip
+    beside: float  # metres from hip to hip across the line of sight
+    measured: float  # metres by which the left hip's skin is farther; NaN where either is not seen
 
     @classmethod
     def find(cls, pixels: Floats, chest: Floats, trunk: float, radius: float, view: _View) -> _Hips | None:

@@ -38,14 +38,10 @@ MAX_BODIES = 16  # largest number of a message's bodies that are merged; cameras
 class CameraFrame:
     """The bodies in one frame of one camera."""
 
-    stamp_ns: int
-    """time of capture, nanoseconds"""
-    joints: Floats
-    """(N, 22, 3) metres, world; NaN where unobserved"""
-    confidence: Floats
-    """(N, 22), 0 where unobserved"""
-    eye: Floats
-    """(3,) metres, world: where the camera stands"""
+    stamp_ns: int  # time of capture, nanoseconds
+    joints: Floats  # (N, 22, 3) metres, world; NaN where unobserved
+    confidence: Floats  # (N, 22), 0 where unobserved
+    eye: Floats  # (3,) metres, world: where the camera stands
 
 
 class Merge:
@@ -130,12 +126,9 @@ class Merge:
 class CameraBody:
     """One body as one camera observes it."""
 
-    joints: Floats
-    """(22, 3) metres, world; NaN where unobserved"""
-    confidence: Floats
-    """(22,)"""
-    eye: Floats
-    """(3,) metres, world"""
+    joints: Floats  # (22, 3) metres, world; NaN where unobserved
+    confidence: Floats  # (22,)
+    eye: Floats  # (3,) metres, world
 
 
 def match_views(views: list[CameraFrame]) -> list[list[CameraBody]]:

@@ -28,10 +28,8 @@ UNIT_TOLERANCE = 0.01  # largest deviation from 1 of the norm of a sensor's quat
 class BodyJoints(NamedTuple):
     """Joints of a body, or of S bodies by slot."""
 
-    positions: Floats
-    """(22, 3) or (S, 22, 3) metres, z up; NaN where unobserved"""
-    confidence: Floats
-    """(22,) or (S, 22) in 0..1"""
+    positions: Floats  # (22, 3) or (S, 22, 3) metres, z up; NaN where unobserved
+    confidence: Floats  # (22,) or (S, 22) in 0..1
 
 
 class RecentMessages(deque[PoseRaw]):

@@ -93,10 +93,8 @@ class Verdict(Enum):
     """Result of judging one pose."""
 
     ACCEPTED = auto()
-    SUSPECT = auto()
-    """a jump that may be an outlier: skip this frame"""
-    MOVED = auto()
-    """a confirmed jump: the sensor was moved, start anew"""
+    SUSPECT = auto()  # a jump that may be an outlier: skip this frame
+    MOVED = auto()  # a confirmed jump: the sensor was moved, start anew
 
 
 class SensorPoseGate:

@@ -91,8 +91,7 @@ class _Stream:
 
 class StreamBatch(BodyPipeline[tuple[str, int]]):
     """The prior for many streams, at most ``max_streams``, which are distinguished by their messages' ``source``.
-    ``settings.max_bodies`` limits all of them together.
-    """
+    ``settings.max_bodies`` limits all of them together."""
 
     def __init__(self, settings: PriorSettings, max_streams: int) -> None:
         super().__init__(settings)

@@ -93,8 +93,7 @@ class PersonEstimator:
 
     def update(self, smoothed: Smoothed | None, bias_sigma: Floats, present: Bools) -> Person:
         """Sample the newest estimate, if there is one, of the bodies ``present`` (S,) for which a sample is due, and
-        renew the bones. ``bias_sigma`` (S,) metres along an axis is the sensor's bias estimated so far.
-        """
+        renew the bones. ``bias_sigma`` (S,) metres along an axis is the sensor's bias estimated so far."""
         if not self._settings.enabled or smoothed is None:
             return self.current
         # smoothed positions, because noise lengthens bones
@@ -161,8 +160,7 @@ class BiasEstimator:
 
     def update(self, smoothed: Smoothed | None, person: Person, jitter: Floats) -> SensorBias:
         """Update the estimate with a smoothed frame, if there is one, of bodies with these bones and this jitter (S,)
-        of the sensor, metres along an axis.
-        """
+        of the sensor, metres along an axis."""
         expected = np.minimum(self._expected, JITTER_RATIO * jitter)
         bias, variance = expected.copy(), np.full((len(expected), len(RIGID)), UNKNOWN_VARIANCE)
         if smoothed is not None:

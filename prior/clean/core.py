@@ -161,8 +161,7 @@ class CleanCore:
 
     def note_published(self, frame: CleanFrame, published: Collection[int]) -> None:
         """Reset bodies that have been observed for `UNPUBLISHED_S` without a publishable estimate; ``published`` are
-        the slots of the bodies in ``frame`` that were published.
-        """
+        the slots of the bodies in ``frame`` that were published."""
         missed: Bools = np.asarray(np.isfinite(frame.observed).any(axis=(1, 2)))
         missed[list(published)] = False
         self._unpublished = np.where(missed, self._unpublished + 1, 0)

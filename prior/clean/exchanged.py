@@ -85,8 +85,7 @@ class ExchangedLimbs:
 
     def begin(self, positions: Floats) -> Bools:
         """Swap limbs back, in place, in the first frames of bodies (S, 22, 3) metres, NaN where unobserved, for which
-        another of `_FIRST_ORDERS` is far likelier. Return which joints (S, 22) were swapped.
-        """
+        another of `_FIRST_ORDERS` is far likelier. Return which joints (S, 22) were swapped."""
         back = np.zeros(positions.shape[:2], dtype=bool)
         for slot in np.flatnonzero((self._tests > 0) & np.isfinite(positions[:, _CORNERS, 0]).all(axis=1)):
             self._tests[slot] -= 1

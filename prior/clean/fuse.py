@@ -41,10 +41,8 @@ _MIN_VARIANCE = 1e-10  # least variance of a position, m²: a hundredth of a mil
 class Precision(NamedTuple):
     """Inverse variances of each joint's position along an axis, 1/m^2, (S, 22)."""
 
-    smoother: Floats
-    """precision of the smoother"""
-    prior: Floats
-    """precision of the prior"""
+    smoother: Floats  # precision of the smoother
+    prior: Floats  # precision of the prior
 
 
 class Fuse:

@@ -27,8 +27,7 @@ SIGMA_SCALE = 1.2  # error-to-sigma ratio of HG-VAE for limbs hidden for 0.3 to 
 
 def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed | None:
     """Complete the last ``frames`` frames, still to be published, of every body that has hidden joints in them; None if
-    no body has. ``jitter`` (S,) metres along an axis is each body's.
-    """
+    no body has. ``jitter`` (S,) metres along an axis is each body's."""
     if windows is None:
         return None
     tracks, reconstruction = windows.tracks, windows.reconstruction
@@ -48,8 +47,7 @@ def impute(windows: BodyWindows | None, jitter: Floats, frames: int) -> Imputed 
 
 def completed_tracks(tracks: Tracks, mean: Floats, noise: Floats | float = 0.0) -> Floats:
     """Fill gaps of windows (..., 66, T) metres with their reconstruction ``mean``, continuous at their edges. ``noise``
-    (...) is the jitter of the observed joints, metres along an axis.
-    """
+    (...) is the jitter of the observed joints, metres along an axis."""
     frames = mean.shape[-1]
     off, observed = (part.reshape(-1, frames) for part in (tracks.x - mean, tracks.observed))
     edges = np.empty(mean.shape[:-1], dtype=np.int64)

@@ -65,23 +65,17 @@ FIRST_SPEED = 3.0  # standard deviation of the velocity along an axis before it 
 class Placed(NamedTuple):
     """N occluded joints."""
 
-    joints: NDArray[np.intp]
-    """(N, 2) row of the body, and index of the joint"""
-    positions: Floats
-    """(N, 3) metres"""
-    sigma: Floats
-    """(N,) metres, standard deviation along an axis"""
+    joints: NDArray[np.intp]  # (N, 2) row of the body, and index of the joint
+    positions: Floats  # (N, 3) metres
+    sigma: Floats  # (N,) metres, standard deviation along an axis
 
 
 class Track(NamedTuple):
     """The last frames of S bodies, for joints that are observed again within the delay."""
 
-    positions: Floats
-    """(T, S, 22, 3) metres, observations; NaN where unobserved"""
-    at: int
-    """index of the frame to be estimated"""
-    noise: Floats
-    """(S,) metres along an axis, standard deviation of the observations"""
+    positions: Floats  # (T, S, 22, 3) metres, observations; NaN where unobserved
+    at: int  # index of the frame to be estimated
+    noise: Floats  # (S,) metres along an axis, standard deviation of the observations
 
 
 class OccludedJoints:

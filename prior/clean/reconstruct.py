@@ -59,8 +59,7 @@ class Reconstruct:
 
     def update(self, history: History, present: Bools, person: Person, bias_sigma: Floats) -> BodyWindows | None:
         """Reconstruct the windows of the bodies ``present`` (S,); None if there is none. ``bias_sigma`` (S,) metres
-        along an axis is estimated from each body.
-        """
+        along an axis is estimated from each body."""
         slots = np.flatnonzero(present)
         if not len(slots):
             return None
@@ -73,8 +72,7 @@ class Reconstruct:
 
 class Denoise:
     """Moves the smoother's estimate of observed joints towards HG-VAE's reconstruction, ``delay_frames`` behind the
-    newest frame.
-    """
+    newest frame."""
 
     def __init__(self, delay_frames: int, slots: int) -> None:
         self._apart = np.zeros((slots, 22))  # m², mean square of the distance between the two estimates along an axis
@@ -98,8 +96,7 @@ class Denoise:
     ) -> Smoothed | None:
         """Add HG-VAE's reconstruction of the newest windows, if any, and denoise the smoother's newest estimate,
         ``delay_frames`` before the newest frame, if any. ``jitter`` and ``bias_sigma`` (S,) metres along an axis are
-        estimated from each body so far.
-        """
+        estimated from each body so far."""
         self._take(windows, history)
         if smoothed is None:
             return None

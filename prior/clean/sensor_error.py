@@ -96,8 +96,7 @@ class DepthError:
 
     def update(self, smoothed: Smoothed | None, white: Floats) -> Floats:
         """Add a smoothed frame, if there is one, and return the standard deviation (S,) that its deviations omit,
-        metres along an axis. ``white`` (S,) is the share of the noise that is white, which they include in full.
-        """
+        metres along an axis. ``white`` (S,) is the share of the noise that is white, which they include in full."""
         if smoothed is None:
             return np.zeros(len(white))
         _take_in(smoothed.positions, smoothed.sigma, self._frames, self._length, self._normal, self._right, self._total)

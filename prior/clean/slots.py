@@ -47,8 +47,7 @@ class Slots(Generic[Key]):
 
     def crowded_out(self, most: int, bodies: Iterable[tuple[Key | None, BodyJoints]], sensor: Floats) -> Bools:
         """Return the slots (S,) of those bodies, farthest from the sensor (3,), beyond the ``most`` for which there is
-        time from now on.
-        """
+        time from now on."""
         self._most = most
         out = np.zeros(len(self.keys), dtype=bool)
         if most < len(self.keys):

@@ -35,10 +35,8 @@ _HOP = 32
 class View(NamedTuple):
     """A window."""
 
-    start: int
-    """its first frame"""
-    weight: Floats
-    """(frames,) weight of its output where windows overlap"""
+    start: int  # its first frame
+    weight: Floats  # (frames,) weight of its output where windows overlap
 
     @property
     def frames(self) -> slice:

@@ -50,14 +50,10 @@ class CompletionError(ValueError):
 class Stretch:
     """A body on the grid, from its first observation until it was unobserved for long."""
 
-    body: int
-    """its id"""
-    first: int
-    """index on the grid of its first frame"""
-    given: Floats
-    """(T, 22, 3) metres, z up; NaN where unknown"""
-    offsets: Floats
-    """(22, 3) metres, its bones"""
+    body: int  # its id
+    first: int  # index on the grid of its first frame
+    given: Floats  # (T, 22, 3) metres, z up; NaN where unknown
+    offsets: Floats  # (22, 3) metres, its bones
 
 
 @dataclass(frozen=True)
@@ -247,8 +243,7 @@ def _clean_messages(
 
 def along_paths(completion: Completion, weights: str) -> list[PoseClean]:
     """Return ``pose/clean`` with bodies that are known only relative to their root moved along predicted paths;
-    ``weights`` are those of the root velocity network.
-    """
+    ``weights`` are those of the root velocity network."""
     if not completion.centred:
         return completion.clean
     network = LiveRootVelocity.load(weights)

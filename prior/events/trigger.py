@@ -46,8 +46,7 @@ class Trigger:
 
     def update(self, stamp_ns: int, value: float, sigma: float, possible: bool = True) -> bool:
         """Process the next value and its standard deviation; returns whether the condition has begun or ended. Of NaN,
-        nothing begins or ends. Without its other requirements (``possible``), a condition ends.
-        """
+        nothing begins or ends. Without its other requirements (``possible``), a condition ends."""
         self.confidence = probability_above(value, sigma, 0.5 * (self._on + self._off))
         doubt = self._sigmas * sigma
         begins, ends = possible and value - doubt > self._on, not possible or value + doubt < self._off

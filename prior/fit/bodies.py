@@ -47,14 +47,10 @@ _MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
 class Seen:
     """One body while it is present without a gap, at 30 Hz."""
 
-    id: int
-    """id of the body"""
-    clean: Sequence[PoseClean]
-    """(T,) messages that contain it"""
-    bodies: Sequence[CleanBody]
-    """(T,) the body in ``pose/clean``"""
-    calibrated: bool
-    """whether the world's floor is at 0"""
+    id: int  # id of the body
+    clean: Sequence[PoseClean]  # (T,) messages that contain it
+    bodies: Sequence[CleanBody]  # (T,) the body in ``pose/clean``
+    calibrated: bool  # whether the world's floor is at 0
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -111,8 +107,7 @@ def bodies_seen(messages: Sequence[tuple[str, Message]], least: int) -> list[See
 
 def track_of(seen: Seen, points: Floats | None) -> Track:
     """Build the track to fit of a body, starting from ``pose/clean``; ``points`` (T, N, 3) metres, world, are of its
-    surface, padded with NaN.
-    """
+    surface, padded with NaN."""
     positions, raw = seen.in_world("positions"), seen.in_world("raw_positions")
     floor = 0.0 if seen.calibrated else lowest_floor(positions)
     start = Start.of_joints(positions, floor, rotations=seen.rotations, ground_known=seen.calibrated)

@@ -68,12 +68,9 @@ def bisquare(square: Tensor, scale: float) -> Tensor:
 class Transitions(Quadratic):
     """E_CVAE, and the defect of each step: the difference of its next state from the decoder's."""
 
-    joints_sigma: float = 0.008
-    """metres, the decoder's error of joints in a step"""
-    rotations_sigma: float = 0.04
-    """the decoder's error of entries of rotation matrices"""
-    latent_sigma: float = 1.0
-    """scale of the prior's standard deviation: 1 is the prior, more is wider"""
+    joints_sigma: float = 0.008  # metres, the decoder's error of joints in a step
+    rotations_sigma: float = 0.04  # the decoder's error of entries of rotation matrices
+    latent_sigma: float = 1.0  # scale of the prior's standard deviation: 1 is the prior, more is wider
 
     def residual(self, motion: Motion) -> Tensor:
         predicted, _ = motion.predicted
@@ -120,8 +117,7 @@ class Smooth(Quadratic):
 class Bones(Quadratic):
     """E_shape: bones stay near their initial values."""
 
-    sigma: float = 0.01
-    """metres along an axis"""
+    sigma: float = 0.01  # metres along an axis
 
     def residual(self, motion: Motion) -> Tensor:
         return motion.variables.bones / self.sigma
@@ -131,12 +127,9 @@ class Bones(Quadratic):
 class Ground(Quadratic):
     """E_gnd: a normal prior of the ground's height and tilt."""
 
-    height: float
-    """metres, world, mean height"""
-    height_sigma: float
-    """metres, standard deviation of the height"""
-    tilt_sigma: float
-    """radians, standard deviation of the tilt"""
+    height: float  # metres, world, mean height
+    height_sigma: float  # metres, standard deviation of the height
+    tilt_sigma: float  # radians, standard deviation of the tilt
 
     def residual(self, motion: Motion) -> Tensor:
         ground = motion.variables.ground
@@ -150,10 +143,8 @@ class Standing(Quadratic):
     The decoder's contact probabilities weigh the term, detached. Otherwise, having no contacts would be cheapest.
     """
 
-    speed_sigma: float = 0.1
-    """m/s along an axis, standard deviation of the velocity of a joint in contact"""
-    height_sigma: float = 0.02
-    """metres, standard deviation of heights beyond `CONTACT_HEIGHT` and below the ground"""
+    speed_sigma: float = 0.1  # m/s along an axis, standard deviation of the velocity of a joint in contact
+    height_sigma: float = 0.02  # metres, standard deviation of heights beyond `CONTACT_HEIGHT` and below the ground
 
     def residual(self, motion: Motion) -> Tensor:
         joints = motion.joints[:, _CONTACTS]
@@ -171,10 +162,8 @@ class Standing(Quadratic):
 class Anchored(Quadratic):
     """The first F frames stay near the result of the window before."""
 
-    joints: Tensor
-    """(F, 22, 3) metres, world"""
-    sigma: float = 0.005
-    """metres along an axis"""
+    joints: Tensor  # (F, 22, 3) metres, world
+    sigma: float = 0.005  # metres along an axis
 
     def residual(self, motion: Motion) -> Tensor:
         return (motion.world_joints[: len(self.joints)] - self.joints) / self.sigma

@@ -47,18 +47,12 @@ POSE = 3 + 6 * JOINT_COUNT
 class HumorConfig:
     """Sizes, and switches of the ablations."""
 
-    latent: int = 48
-    """dimensions of a transition's latent"""
-    hidden: int = 512
-    """width of the hidden layers"""
-    learned_prior: bool = True
-    """whether the prior depends on the state; if not, it is N(0, I), as in a Motion VAE"""
-    residual: bool = True
-    """whether the decoder outputs the change of the state; if not, it outputs the next pose"""
-    contacts: bool = True
-    """whether it predicts contacts"""
-    components: int = 12
-    """number of components of the mixture of initial states"""
+    latent: int = 48  # dimensions of a transition's latent
+    hidden: int = 512  # width of the hidden layers
+    learned_prior: bool = True  # whether the prior depends on the state; if not, it is N(0, I), as in a Motion VAE
+    residual: bool = True  # whether the decoder outputs the change of the state; if not, it outputs the next pose
+    contacts: bool = True  # whether it predicts contacts
+    components: int = 12  # number of components of the mixture of initial states
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HumorConfig:
@@ -70,10 +64,8 @@ class HumorConfig:
 class Gaussian:
     """A diagonal Gaussian of latents."""
 
-    mean: Tensor
-    """(..., latent)"""
-    log_variance: Tensor
-    """the same shape"""
+    mean: Tensor  # (..., latent)
+    log_variance: Tensor  # the same shape
 
     @property
     def sigma(self) -> Tensor:
@@ -201,16 +193,13 @@ def _gaussian(output: Tensor) -> Gaussian:
 class Rollout:
     """T predicted steps."""
 
-    states: State
-    """(..., T) states, without the initial one"""
-    contacts: Tensor
-    """(..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none"""
+    states: State  # (..., T) states, without the initial one
+    contacts: Tensor  # (..., T, 16) logits of load, then of rest; (..., T, 0) if the model has none
 
 
 def roll_out(model: HumorNet, initial: State, latents: Tensor, offsets: Tensor) -> Rollout:
     """Compute x_T = f(x_0, z_1..T), section 3, from states (...), latents (..., T, latent) and bones (..., 22, 3)
-    metres.
-    """
+    metres."""
     return _rolled(model, initial, offsets, list(latents.unbind(dim=-2)))
 
 

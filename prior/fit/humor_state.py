@@ -31,16 +31,11 @@ _MIN_LEVEL = 1e-4
 class State:
     """States of any number of bodies, z up, floor at 0, with equal leading dimensions (...)."""
 
-    root: Tensor
-    """(..., 3) metres, the pelvis"""
-    rotations: Tensor
-    """(..., 22, 3, 3) local; the root's is its orientation"""
-    joints: Tensor
-    """(..., 22, 3) metres"""
-    velocity: Tensor
-    """(..., 22, 3) m/s, velocities of the joints since the previous step"""
-    turning: Tensor
-    """(..., 3) rad/s, angular velocity of the root since the previous step"""
+    root: Tensor  # (..., 3) metres, the pelvis
+    rotations: Tensor  # (..., 22, 3, 3) local; the root's is its orientation
+    joints: Tensor  # (..., 22, 3) metres
+    velocity: Tensor  # (..., 22, 3) m/s, velocities of the joints since the previous step
+    turning: Tensor  # (..., 3) rad/s, angular velocity of the root since the previous step
 
     def __getitem__(self, at: object) -> State:
         """Select bodies by indices of the leading dimensions."""
@@ -63,8 +58,7 @@ def choose(mask: Tensor, yes: State, no: State) -> State:
 
 def states_of(root: Tensor, rotations: Tensor, offsets: Tensor) -> State:
     """Return the states (..., T - 1) of a motion from its second frame on; the first has no velocity. ``root`` (..., T,
-    3) metres and local rotations (..., T, 22, 3, 3) are of one person's bones (..., 22, 3).
-    """
+    3) metres and local rotations (..., T, 22, 3, 3) are of one person's bones (..., 22, 3)."""
     joints = forward_kinematics(rotations, offsets.unsqueeze(-3), root)[0]
     velocity = joints.diff(dim=-3) * FPS
     turned = rotations[..., 1:, 0, :, :] @ rotations[..., :-1, 0, :, :].mT
@@ -136,8 +130,7 @@ def pose_features(inputs: Tensor) -> Tensor:
 
 def moved_by(state: State, change: Tensor, offsets: Tensor) -> State:
     """Advance canonical states (...) by a change (..., `CHANGE`) in metres and radians: HuMoR's Euler step, with
-    rotations multiplied from the left. Bones are (..., 22, 3) metres.
-    """
+    rotations multiplied from the left. Bones are (..., 22, 3) metres."""
     turns = change[..., 3:].unflatten(-1, (JOINT_COUNT, 3))
     return posed(state, state.root + change[..., :3], small_exp(turns) @ state.rotations, offsets)
 

@@ -38,24 +38,15 @@ def float_tensor(values: NDArray[np.floating]) -> Tensor:
 class Variables:
     """The variables of T frames: the initial poses, which are fixed, and offsets from them."""
 
-    start_root: Tensor
-    """(T, 3) metres, in the frame of the ground: z up, floor at 0"""
-    start_rotations: Tensor
-    """(T, 22, 3, 3) local"""
-    start_offsets: Tensor
-    """(22, 3) metres, bones"""
-    root: Tensor
-    """(T, 3) metres, offsets of the root"""
-    orientation: Tensor
-    """(T, 3) rotation vectors of the root, applied from the left"""
-    turns: Tensor
-    """(T, 21, 3) rotation vectors of the other joints, applied from the left"""
-    bones: Tensor
-    """(22, 3) metres, offsets of the bones"""
-    ground: Tensor
-    """(3,) height of the floor above 0 of the world, metres, and its tilts about x and y, radians"""
-    latents: Tensor
-    """(T - 2, latent) relative to the prior's mean, in its standard deviations"""
+    start_root: Tensor  # (T, 3) metres, in the frame of the ground: z up, floor at 0
+    start_rotations: Tensor  # (T, 22, 3, 3) local
+    start_offsets: Tensor  # (22, 3) metres, bones
+    root: Tensor  # (T, 3) metres, offsets of the root
+    orientation: Tensor  # (T, 3) rotation vectors of the root, applied from the left
+    turns: Tensor  # (T, 21, 3) rotation vectors of the other joints, applied from the left
+    bones: Tensor  # (22, 3) metres, offsets of the bones
+    ground: Tensor  # (3,) height of the floor above 0 of the world, metres, and its tilts about x and y, radians
+    latents: Tensor  # (T - 2, latent) relative to the prior's mean, in its standard deviations
 
     @classmethod
     def initial(cls, root: Tensor, rotations: Tensor, offsets: Tensor, height: float, latent: int) -> Variables:

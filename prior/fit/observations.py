@@ -47,10 +47,8 @@ class Observed(Term, Protocol):
 class SeenJoints:
     """E_data of 3D joints or key points, some of them hidden."""
 
-    positions: Tensor
-    """(T, 22, 3) metres, world; NaN where unobserved"""
-    sigma: Tensor
-    """(T, 22) metres along an axis, standard deviations"""
+    positions: Tensor  # (T, 22, 3) metres, world; NaN where unobserved
+    sigma: Tensor  # (T, 22) metres along an axis, standard deviations
 
     @cached_property
     def _seen(self) -> Tensor:
@@ -73,14 +71,10 @@ class SeenJoints:
 class Pinhole:
     """A fixed pinhole camera."""
 
-    focal: Tensor
-    """(2,) pixels"""
-    centre: Tensor
-    """(2,) pixels"""
-    rotation: Tensor
-    """(3, 3) rotation from its optical frame (x right, y down, z forward) to the world"""
-    position: Tensor
-    """(3,) metres, world"""
+    focal: Tensor  # (2,) pixels
+    centre: Tensor  # (2,) pixels
+    rotation: Tensor  # (3, 3) rotation from its optical frame (x right, y down, z forward) to the world
+    position: Tensor  # (3,) metres, world
 
     def project(self, points: Tensor) -> Tensor:
         """(..., 2) pixels of points (..., 3) metres, world; depths are at least 0.1 m."""
@@ -92,14 +86,10 @@ class Pinhole:
 class KeyPoints:
     """E_data of key points in an image, weighted by their confidence, with the Geman-McClure kernel."""
 
-    pixels: Tensor
-    """(T, 22, 2); NaN where not detected"""
-    confidence: Tensor
-    """(T, 22) 0 to 1, the weight, as in the paper; the official code uses its square"""
-    camera: Pinhole
-    """the camera"""
-    sigma: float
-    """pixels along an axis, standard deviation"""
+    pixels: Tensor  # (T, 22, 2); NaN where not detected
+    confidence: Tensor  # (T, 22) 0 to 1, the weight, as in the paper; the official code uses its square
+    camera: Pinhole  # the camera
+    sigma: float  # pixels along an axis, standard deviation
 
     @cached_property
     def _seen(self) -> Tensor:
@@ -133,14 +123,10 @@ class SurfacePoints:
     puts behind a limb's centre would pull towards the limb's back, and the points in front would then bias the body.
     """
 
-    points: Tensor
-    """(T, N, 3) metres, world, padded with NaN"""
-    camera: Tensor
-    """(3,) or (T, 3) metres, world, position of the camera"""
-    sigma: float = POINT_SIGMA
-    """metres, standard deviation"""
-    weight: float = 1.0
-    """weight of a point, below 1 because neighbouring errors are correlated"""
+    points: Tensor  # (T, N, 3) metres, world, padded with NaN
+    camera: Tensor  # (3,) or (T, 3) metres, world, position of the camera
+    sigma: float = POINT_SIGMA  # metres, standard deviation
+    weight: float = 1.0  # weight of a point, below 1 because neighbouring errors are correlated
 
     @cached_property
     def _seen(self) -> Tensor:

@@ -42,16 +42,11 @@ AGREE_WEIGHT = 1.0  # weight of the mean squared difference between overlapping 
 class _Known:
     """The known entries of W windows of T frames, in the windows' frames."""
 
-    columns: Tensor
-    """(W, T, 22, 6) first two columns of local rotations"""
-    rotations: Tensor
-    """(W, T, 22, 1) 1 where rotations are known, else 0"""
-    joints: Tensor
-    """(W, T, 22, 3) metres relative to the root"""
-    places: Tensor
-    """(W, T, 22, 1) 1 where joints are known, else 0"""
-    offsets: Tensor
-    """(22, 3) metres, bones"""
+    columns: Tensor  # (W, T, 22, 6) first two columns of local rotations
+    rotations: Tensor  # (W, T, 22, 1) 1 where rotations are known, else 0
+    joints: Tensor  # (W, T, 22, 3) metres relative to the root
+    places: Tensor  # (W, T, 22, 1) 1 where joints are known, else 0
+    offsets: Tensor  # (22, 3) metres, bones
 
     def loss(self, decoded: Tensor) -> Tensor:
         """Equation 14 for windows (W, T, 22, 6); each term is a mean over known entries."""
@@ -66,8 +61,7 @@ class _Known:
 
 class Optimiser:
     """Completes windows like `PartsCompleter`, by optimisation through ``model`` from the output of ``completer``,
-    which also gives the root. ``seed`` draws initial latents, as in the paper; None takes those of that output.
-    """
+    which also gives the root. ``seed`` draws initial latents, as in the paper; None takes those of that output."""
 
     def __init__(self, model: HMVAE, completer: PartsCompleter, seed: int | None = None) -> None:
         self._model, self._completer, self._seed = model.eval(), completer, seed

@@ -44,12 +44,9 @@ _AXES = [2, 0, 1]
 class SmplShape:
     """A model's first 22 joints in the rest pose."""
 
-    rest: Floats
-    """(22, 3) metres, joints of the mean shape; x forward, y left, z up"""
-    change: Floats
-    """(22, 3, B) metres per unit of each beta, B up to `BETAS`"""
-    gender: str
-    """gender in the file's name"""
+    rest: Floats  # (22, 3) metres, joints of the mean shape; x forward, y left, z up
+    change: Floats  # (22, 3, B) metres per unit of each beta, B up to `BETAS`
+    gender: str  # gender in the file's name
 
     @classmethod
     def read(cls, path: Path) -> SmplShape:
@@ -98,16 +95,11 @@ class SmplShape:
 class SmplMotion:
     """A motion of T frames at 30 Hz, z up."""
 
-    poses: Floats
-    """(T, `POSES`) radians, rotation vectors, the root's first"""
-    betas: Floats
-    """(`BETAS`,) 0 where the model has fewer"""
-    trans: Floats
-    """(T, 3) metres, translations"""
-    gender: str
-    """gender of the model"""
-    joints: Floats
-    """(T, 22, 3) metres, the model's joints"""
+    poses: Floats  # (T, `POSES`) radians, rotation vectors, the root's first
+    betas: Floats  # (`BETAS`,) 0 where the model has fewer
+    trans: Floats  # (T, 3) metres, translations
+    gender: str  # gender of the model
+    joints: Floats  # (T, 22, 3) metres, the model's joints
 
     @property
     def arrays(self) -> dict[str, Any]:
@@ -120,8 +112,7 @@ class SmplMotion:
 
 def smpl_motion(shape: SmplShape, joints: Floats, lengths: Floats) -> SmplMotion:
     """Fit the motion of a model of this shape to joints (T, 22, 3) metres, z up, complete, with these bone lengths
-    (22,).
-    """
+    (22,)."""
     betas = shape.of_lengths(lengths)
     rest = shape.joints(betas)
     bones = np.where(PARENT[:, None] >= 0, rest - rest[PARENT], 0.0)

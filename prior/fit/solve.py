@@ -106,12 +106,9 @@ class Start:
 class Fitted:
     """The fit of a window."""
 
-    motion: Motion
-    """motion of least energy, without gradients, of the last stage or the one before"""
-    energies: tuple[float, ...]
-    """(stages,) nats, energy of a stage's terms at its end"""
-    kept: bool = True
-    """whether the last stage was kept"""
+    motion: Motion  # motion of least energy, without gradients, of the last stage or the one before
+    energies: tuple[float, ...]  # (stages,) nats, energy of a stage's terms at its end
+    kept: bool = True  # whether the last stage was kept
 
 
 def fit_window(

@@ -18,8 +18,7 @@ from steadypose.prior.models.weights import load_weights
 def forward_kinematics(rotations: Tensor, offsets: Tensor, root: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Compute joint positions (..., 22, 3) metres and global rotations (..., 22, 3, 3), in the frame of the root's
     rotation, from local rotations (..., 22, 3, 3), bones (..., 22, 3) and the root's position (..., 3), the origin if
-    omitted.
-    """
+    omitted."""
     batch = rotations.shape[:-3]
     offsets = offsets.expand(*batch, *offsets.shape[-2:]).unsqueeze(-1)
     origin = rotations.new_zeros(*batch, 3) if root is None else root
@@ -49,8 +48,7 @@ def from_6d(x: Tensor) -> Tensor:
 
 def remove_heading(rotations: Tensor, frame: int) -> tuple[Tensor, Tensor]:
     """Turn windows of local rotations (B, T, 22, 3, 3), z up, about the vertical so that the body faces +x in
-    ``frame``. Returns them, and the yaw matrices (B, 3, 3) that turn them back.
-    """
+    ``frame``. Returns them, and the yaw matrices (B, 3, 3) that turn them back."""
     back = yaw_rotation(heading(rotations[:, frame, 0]))
     turned = rotations.clone()
     turned[:, :, 0] = back.transpose(-1, -2)[:, None] @ rotations[:, :, 0]

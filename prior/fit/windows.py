@@ -31,10 +31,8 @@ MIN_FRAMES = 8  # length of the shortest track that is fitted, frames
 class Track:
     """One body at 30 Hz, T frames without a gap."""
 
-    starts: Sequence[Start]
-    """initial poses; if there are several, each window keeps the fit of least energy"""
-    observed: Sequence[Observed]
-    """observations of all T frames"""
+    starts: Sequence[Start]  # initial poses; if there are several, each window keeps the fit of least energy
+    observed: Sequence[Observed]  # observations of all T frames
 
     def __len__(self) -> int:
         return len(self.starts[0].root)
@@ -44,22 +42,14 @@ class Track:
 class FittedTrack:
     """The fit of a track."""
 
-    joints: Floats
-    """(T, 22, 3) metres, world"""
-    rotations: Floats
-    """(T, 22, 3, 3) local; the root's to the world"""
-    offsets: Floats
-    """(W, 22, 3) metres, the fitted bones of each of W windows"""
-    ground: Floats
-    """(W, 3) the ground of each window: height, metres, and tilts about x and y, radians"""
-    load: Floats
-    """(T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them"""
-    misfit: Floats
-    """(K, T, 22) `Observed.misfit` of each of K observations"""
-    energies: Floats
-    """(W, S) nats after each stage"""
-    kept: Bools
-    """(W,) whether a window's last stage was kept"""
+    joints: Floats  # (T, 22, 3) metres, world
+    rotations: Floats  # (T, 22, 3, 3) local; the root's to the world
+    offsets: Floats  # (W, 22, 3) metres, the fitted bones of each of W windows
+    ground: Floats  # (W, 3) the ground of each window: height, metres, and tilts about x and y, radians
+    load: Floats  # (T, 8) probabilities that `CONTACT_JOINTS` bear load; NaN if the model does not predict them
+    misfit: Floats  # (K, T, 22) `Observed.misfit` of each of K observations
+    energies: Floats  # (W, S) nats after each stage
+    kept: Bools  # (W,) whether a window's last stage was kept
 
 
 def window_bounds(frames: int) -> list[tuple[int, int]]:
@@ -79,8 +69,7 @@ def fit_track(
     advanced: Callable[[], None] = lambda: None,
 ) -> FittedTrack:
     """Fit all windows of a track, as `fit_window`. ``folder`` is a cache of fitted windows, keyed by a digest of
-    everything that a fit depends on; ``advanced`` is called after each window.
-    """
+    everything that a fit depends on; ``advanced`` is called after each window."""
     done: list[dict[str, Floats]] = []
     starts = track.starts
     for number, (first, last) in enumerate(bounds := window_bounds(len(track))):

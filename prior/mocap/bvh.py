@@ -88,8 +88,7 @@ class Bvh:
     @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """(T, J, 3) positions in the file's unit and axes, by forward kinematics; ``lost_bones``
-        (`prior.body.rigs.Rig`) get their length back if the file has none.
-        """
+        (`prior.body.rigs.Rig`) get their length back if the file has none."""
         offsets = self.offsets.copy()
         for name, multiple in (lost_bones or {}).items():
             joint = self.joints.index(name)

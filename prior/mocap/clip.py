@@ -43,22 +43,14 @@ def documented(read: Callable[P, R]) -> Callable[P, R]:
 class Clip:
     """One recording of one person."""
 
-    name: str
-    """name that is unique within its source"""
-    source: str
-    """the data set"""
-    licence: str
-    """its licence, as an SPDX identifier if there is one"""
-    subject: str
-    """the person, as named by the source"""
-    action: str
-    """what the person does, as named by the source; otherwise empty"""
-    fps: float
-    """frames per second"""
-    skeleton: Skeleton
-    """the skeleton of ``positions``"""
-    positions: NDArray[np.float64]
-    """(T, J, 3) metres, z up; NaN where missing"""
+    name: str  # name that is unique within its source
+    source: str  # the data set
+    licence: str  # its licence, as an SPDX identifier if there is one
+    subject: str  # the person, as named by the source
+    action: str  # what the person does, as named by the source; otherwise empty
+    fps: float  # frames per second
+    skeleton: Skeleton  # the skeleton of ``positions``
+    positions: NDArray[np.float64]  # (T, J, 3) metres, z up; NaN where missing
 
     @property
     def seconds(self) -> float:

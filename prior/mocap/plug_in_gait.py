@@ -160,8 +160,7 @@ def _below(joint: str, place: Array, m: Markers) -> Array:
 
 def calibrate(recordings: Iterable[Markers]) -> Calibration:
     """Measure a subject on all of its recordings, of markers (T, 3) metres by name, z up, NaN where lost. The more the
-    subject moves, the better the axes.
-    """
+    subject moves, the better the axes."""
     recordings = list(recordings)
     joined = {name: np.concatenate([r[name] for r in recordings]) for name in recordings[0]}
     back, forward, _, _ = _pelvis(joined)
@@ -203,8 +202,7 @@ def _bend_axis(joint: str, upper: Array, m: Markers) -> float:
 
 def joint_centres(m: Markers, calibration: Calibration) -> NDArray[np.float64]:
     """Canonical joints (T, 22, 3) metres from a subject's markers (T, 3) metres by name, z up, NaN where lost; NaN
-    where a marker that the joint needs is lost.
-    """
+    where a marker that the joint needs is lost."""
     p: dict[str, Array] = {}
     p["left_hip"], p["right_hip"], p["pelvis"] = _hips(m, calibration)
     p["left_shoulder"], p["right_shoulder"] = _shoulders(m, calibration)

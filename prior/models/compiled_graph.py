@@ -117,8 +117,7 @@ class Program:
 
 class Network:
     """A program with memory for its matrices, for ``max_batch`` windows, each in its row. Later changes to the program
-    have no effect.
-    """
+    have no effect."""
 
     def __init__(self, program: Program, max_batch: int) -> None:
         self._steps = np.array(program.steps, dtype=np.int64)

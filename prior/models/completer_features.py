@@ -82,8 +82,7 @@ class CompleterConfig:
 
 class Window(NamedTuple):
     """Input of the completer for B windows, each transformed so that the first known root is at the origin and faces
-    +x.
-    """
+    +x."""
 
     features: Floats32
     """(B, T, FEATURES) float32"""
@@ -164,8 +163,7 @@ def _unit(vectors: Floats) -> Floats:
 
 def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
     """Build the completer's input from windows (B, T, 22, 3) metres, z up, NaN where unknown, of bones (B, 22, 3);
-    ``usual`` (22, 4) are local quaternions, xyzw, of the mean pose.
-    """
+    ``usual`` (22, 4) are local quaternions, xyzw, of the mean pose."""
     count, frames = positions.shape[:2]
     known = finite_joints(positions)
     bones = np.broadcast_to(offsets[:, None], positions.shape)
@@ -205,16 +203,14 @@ def read_window(positions: Floats, offsets: Floats, usual: Floats) -> Window:
 
 def correction_share(line: Line, whole: float = SHARE_FRAMES) -> Floats32:
     """(B, T, K, 1) share of what a network adds to the cubic: proportional to the gap up to ``whole`` frames, and 1 if
-    a track is known on one side only or never.
-    """
+    a track is known on one side only or never."""
     length = (line.after - line.before)[..., None]
     return np.where(length > 0, np.minimum(length / whole, 1.0), 1.0).astype(np.float32)
 
 
 def growth(between: Floats, half: float) -> Floats:
     """Return the share of a joint's error far from its known frames at ``between`` (see `Uncertainty.of`) frames, one
-    half at ``half`` frames. It is quadratic at first, because positions and velocities are known at the ends.
-    """
+    half at ``half`` frames. It is quadratic at first, because positions and velocities are known at the ends."""
     return 1.0 / (1.0 + np.square(half / between))
 
 

@@ -72,12 +72,9 @@ def contact_features(
 class Contacts(NamedTuple):
     """Contacts of B bodies at `CONTACT_JOINTS`."""
 
-    load: Floats32
-    """(B, 8) probabilities that the joints bear load"""
-    rest: Floats32
-    """(B, 8) probabilities that the joints rest on their support"""
-    state: Floats32
-    """(B, hidden) hidden state for the next frame"""
+    load: Floats32  # (B, 8) probabilities that the joints bear load
+    rest: Floats32  # (B, 8) probabilities that the joints rest on their support
+    state: Floats32  # (B, hidden) hidden state for the next frame
 
 
 class LiveContacts:

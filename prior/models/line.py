@@ -15,16 +15,11 @@ from steadypose.prior.compiled import njit
 class Line(NamedTuple):
     """Interpolation of each track of B windows: here 22 rotations and, last, the root's position."""
 
-    before: NDArray[np.int64]
-    """(B, T, 23) index of the last known frame; of the next one if there is none before"""
-    after: NDArray[np.int64]
-    """(B, T, 23) index of the next known frame; of the last one if there is none after"""
-    weight: Floats32
-    """(B, T, 23) float32, interpolation weight from 0 (before) to 1 (after)"""
-    known: Bools
-    """(B, T, 23) whether the frame itself is known"""
-    ever: Bools
-    """(B, 23) whether any frame is known"""
+    before: NDArray[np.int64]  # (B, T, 23) index of the last known frame; of the next one if there is none before
+    after: NDArray[np.int64]  # (B, T, 23) index of the next known frame; of the last one if there is none after
+    weight: Floats32  # (B, T, 23) float32, interpolation weight from 0 (before) to 1 (after)
+    known: Bools  # (B, T, 23) whether the frame itself is known
+    ever: Bools  # (B, 23) whether any frame is known
 
 
 def draw_line(known: Bools) -> Line:

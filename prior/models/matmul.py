@@ -129,8 +129,7 @@ _row_wide, _row_narrow = _tile(1, _WIDE), _tile(1, 1)
 @njit(cache=True)
 def multiply(a, weight, shift, product):
     """Write ``shift + a @ weight``, of float32 matrices in C order, to ``product``, which must not overlap them.
-    ``shift`` has one row, or as many as ``product``. Matrices that do not fit raise a ValueError.
-    """
+    ``shift`` has one row, or as many as ``product``. Matrices that do not fit raise a ValueError."""
     inner, columns = weight.shape
     _check(a, inner, columns == product.shape[1], shift, product)
     if columns >= LANES:

@@ -283,23 +283,17 @@ error-to-sigma ratio is 1.0 to 1.3 over occlusions of 0.2 s to 4 s."""
 class Occluded(NamedTuple):
     """N occluded joints of several bodies."""
 
-    body: NDArray[np.intp]
-    """(N,) row of the body"""
-    joint: NDArray[np.intp]
-    """(N,) index of the joint"""
-    candidates: Floats
-    """(N, 4, 3) metres, in the order of `CANDIDATES`"""
-    features: Floats32
-    """(N, `FEATURES`) float32"""
+    body: NDArray[np.intp]  # (N,) row of the body
+    joint: NDArray[np.intp]  # (N,) index of the joint
+    candidates: Floats  # (N, 4, 3) metres, in the order of `CANDIDATES`
+    features: Floats32  # (N, `FEATURES`) float32
 
 
 class Weighed(NamedTuple):
     """Estimates of N occluded joints."""
 
-    positions: Floats
-    """(N, 3) metres, in the frame of the candidates"""
-    sigma: Floats
-    """(N,) metres, standard deviation along an axis"""
+    positions: Floats  # (N, 3) metres, in the frame of the candidates
+    sigma: Floats  # (N,) metres, standard deviation along an axis
 
 
 class LiveOcclusion:

@@ -63,14 +63,10 @@ _LEAST = 1e-6
 class Expected(NamedTuple):
     """Expected joints of B bodies."""
 
-    positions: Floats
-    """(B, 22, 3) metres"""
-    sigma: Floats
-    """(B, 22) metres, their standard deviations along an axis"""
-    root: Floats
-    """(B, 3, 3) orientations of the pelvis"""
-    root_covariance: Floats
-    """(B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise"""
+    positions: Floats  # (B, 22, 3) metres
+    sigma: Floats  # (B, 22) metres, their standard deviations along an axis
+    root: Floats  # (B, 3, 3) orientations of the pelvis
+    root_covariance: Floats  # (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise
 
 
 class LivePosture:
@@ -94,8 +90,7 @@ class LivePosture:
 
     def __call__(self, positions: Floats, sigma: Floats, lengths: Floats) -> Expected:
         """Estimate joints (B, 22, 3) metres from noisy ones, their standard deviations (B, 22) along an axis, and the
-        lengths (B, 22) of each joint's bone, 0 for the root.
-        """
+        lengths (B, 22) of each joint's bone, 0 for the root."""
         frame, middle = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1)
         size = lengths.sum(axis=-1) / _REST_SIZE
         scale = size[:, None, None]
@@ -139,8 +134,7 @@ class LivePosture:
 
 def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
     """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances:
-    observed joints (B, 22, 3) metres, deviations (B, 22) along an axis and bones (B, 22, 3).
-    """
+    observed joints (B, 22, 3) metres, deviations (B, 22) along an axis and bones (B, 22, 3)."""
     known, rigid = expected.root_covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
     off = to_rotation_vectors(expected.root.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
     share = known @ np.linalg.inv(known + rigid)
@@ -155,8 +149,7 @@ class RootCovariance:
 
     def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
         """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame, of joints (B, 22,
-        3) metres, deviations (B, 22) along an axis and orientations of the pelvis (B, 3, 3).
-        """
+        3) metres, deviations (B, 22) along an axis and orientations of the pelvis (B, 3, 3)."""
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0
         known = self._posture(positions, sigma, np.linalg.norm(bones, axis=-1)).root_covariance + np.diag(WITHIN**2)

@@ -44,12 +44,9 @@ class TrajectoryConfig:
 class NewestMotion(NamedTuple):
     """The network's output for a frame, in the frame of its input."""
 
-    velocity: Floats32
-    """(B, 3) m/s, velocity of the root"""
-    log_sigma: Floats32
-    """(B, 3) logarithm of the velocity's standard deviation along each axis, in m/s"""
-    state: Floats32
-    """(B, hidden) hidden state for the next frame"""
+    velocity: Floats32  # (B, 3) m/s, velocity of the root
+    log_sigma: Floats32  # (B, 3) logarithm of the velocity's standard deviation along each axis, in m/s
+    state: Floats32  # (B, hidden) hidden state for the next frame
 
 
 def velocity_features(joints: Floats, before: Floats, dt: Floats | float, yaw: Floats) -> Floats32:

@@ -27,10 +27,8 @@ FEATURES = 3 * VECTORS + 2 + 22
 class CorrectionConfig:
     """Sizes of a correction network."""
 
-    hidden: int = 256
-    """width of its two hidden layers"""
-    sensor: str = "kinect_v2"
-    """name of the sensor that it corrects"""
+    hidden: int = 256  # width of its two hidden layers
+    sensor: str = "kinect_v2"  # name of the sensor that it corrects
 
 
 def trunk_frame(positions: Floats) -> Floats:

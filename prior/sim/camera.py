@@ -40,28 +40,17 @@ FRAME_ID = "camera_optical_frame"
 class Camera:
     """A camera: its pose, field of view, timing and tracker."""
 
-    position: tuple[float, float, float]
-    """metres, world"""
-    look_at: tuple[float, float, float]
-    """metres, world, the point in the middle of the image"""
-    roll: float = 0.0
-    """radians about the line of sight, positive clockwise as seen in the image"""
-    field_of_view: tuple[float, float] = (1.22, 1.05)
-    """radians, horizontal and vertical"""
-    near: float = 0.5
-    """metres, distance below which it measures no depth"""
-    background: float = 5.5
-    """metres along the line of sight to the wall behind the people"""
-    fps: float = 30.0
-    """nominal frames per second"""
-    stamp_jitter: float = 0.002
-    """seconds, standard deviation of the frames' times about equal intervals"""
-    drop_rate: float = 0.01
-    """share of frames that never arrive"""
-    skeleton: str = "kinect22"
-    """joint layout of its tracker"""
-    calibrated: bool = True
-    """whether its pose in the world is known; if not, only the direction of gravity is"""
+    position: tuple[float, float, float]  # metres, world
+    look_at: tuple[float, float, float]  # metres, world, the point in the middle of the image
+    roll: float = 0.0  # radians about the line of sight, positive clockwise as seen in the image
+    field_of_view: tuple[float, float] = (1.22, 1.05)  # radians, horizontal and vertical
+    near: float = 0.5  # metres, distance below which it measures no depth
+    background: float = 5.5  # metres along the line of sight to the wall behind the people
+    fps: float = 30.0  # nominal frames per second
+    stamp_jitter: float = 0.002  # seconds, standard deviation of the frames' times about equal intervals
+    drop_rate: float = 0.01  # share of frames that never arrive
+    skeleton: str = "kinect22"  # joint layout of its tracker
+    calibrated: bool = True  # whether its pose in the world is known; if not, only the direction of gravity is
 
     @property
     def orientation(self) -> Floats:
@@ -103,10 +92,8 @@ class Camera:
 class Sight:
     """Occlusion of joints (T, J) from a camera."""
 
-    hidden: Floats
-    """0 if visible, 1 behind a body, between 0 and 1 at its edge"""
-    beside: Floats
-    """metres, depth of the nearest other surface that the ray almost touches; infinite if there is none"""
+    hidden: Floats  # 0 if visible, 1 behind a body, between 0 and 1 at its edge
+    beside: Floats  # metres, depth of the nearest other surface that the ray almost touches; infinite if there is none
 
 
 def sight(points: Floats, bodies: Sequence[Motion], position: Floats) -> Sight:
@@ -171,8 +158,7 @@ def film(
     people: Sequence[Motion], camera: Camera, noise: NoiseModel, rng: np.random.Generator, source: str, start_ns: int
 ) -> list[PoseRaw]:
     """Simulate the camera's tracker output, with its error model, of motions of equal duration whose second 0 has the
-    stamp ``start_ns``: frames in the order of their stamps, with the `Camera.estimated_pose`.
-    """
+    stamp ``start_ns``: frames in the order of their stamps, with the `Camera.estimated_pose`."""
     times = camera.capture_times(min(m.times[-1] for m in people), rng)
     filmed = [m.at(times) for m in people]
     tracks = [_track(k, filmed, camera, noise, times, rng) for k in range(len(filmed))]

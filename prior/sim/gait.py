@@ -56,8 +56,7 @@ def track(times: Floats, initial: ArrayLike, keys: Sequence[Key]) -> Floats:
 
 def drift(rng: np.random.Generator, times: Floats, std: ArrayLike, slowest_s: float, fastest_s: float) -> Floats:
     """Random smooth motion (T, C) of these long-term standard deviations (C,): six sinusoids per channel with random
-    periods, between these two in seconds, and phases.
-    """
+    periods, between these two in seconds, and phases."""
     std = np.atleast_1d(np.asarray(std, dtype=np.float64))
     waves = 6
     period = np.exp(rng.uniform(np.log(fastest_s), np.log(slowest_s), (waves, len(std))))
@@ -111,18 +110,12 @@ class Turn:
 class Plan:
     """The pelvis over the floor."""
 
-    times: Floats
-    """(T,) seconds at `RATE`"""
-    xy: Floats
-    """(T, 2) metres, world"""
-    yaw: Floats
-    """(T,) radians, unwrapped"""
-    phase: Floats
-    """(T,) strides made"""
-    speed: Floats
-    """(T,) m/s along the path"""
-    moves: tuple[slice, ...]
-    """slice of frames of each walk or turn"""
+    times: Floats  # (T,) seconds at `RATE`
+    xy: Floats  # (T, 2) metres, world
+    yaw: Floats  # (T,) radians, unwrapped
+    phase: Floats  # (T,) strides made
+    speed: Floats  # (T,) m/s along the path
+    moves: tuple[slice, ...]  # slice of frames of each walk or turn
 
 
 def plan(start: tuple[float, float], yaw: float, parts: Sequence[Stand | Walk | Turn]) -> Plan:
@@ -187,16 +180,11 @@ def _phase(before: float, speed: Floats, heading: Floats) -> Floats:
 class FootTrack:
     """One foot over time."""
 
-    ankle: Floats
-    """(T, 3) metres, world"""
-    yaw: Floats
-    """(T,) radians, direction of the foot"""
-    pitch: Floats
-    """(T,) radians, positive with the toe down"""
-    heel_planted: Bools
-    """(T,) whether the ankle stays in place"""
-    toe_planted: Bools
-    """(T,) whether the ball of the foot stays in place"""
+    ankle: Floats  # (T, 3) metres, world
+    yaw: Floats  # (T,) radians, direction of the foot
+    pitch: Floats  # (T,) radians, positive with the toe down
+    heel_planted: Bools  # (T,) whether the ankle stays in place
+    toe_planted: Bools  # (T,) whether the ball of the foot stays in place
 
     @property
     def rotation(self) -> Floats:
@@ -206,8 +194,7 @@ class FootTrack:
 
 def foot_track(plan: Plan, side: str, offsets: Floats) -> FootTrack:
     """Compute the steps of the foot on one side, "left" or "right", that a plan needs, of a person with bones (22, 3)
-    metres.
-    """
+    metres."""
     sign = 1.0 if side == "left" else -1.0
     sole = offsets[J[f"{side}_foot"]]
     hip = abs(offsets[J[f"{side}_hip"], 1])

@@ -27,16 +27,11 @@ SIGN: Mapping[Side, float] = {"left": 1.0, "right": -1.0}
 class Motion:
     """One person's true motion."""
 
-    times: Floats
-    """(T,) seconds, evenly spaced"""
-    offsets: Floats
-    """(22, 3) metres, the bones"""
-    root: Floats
-    """(T, 3) metres, position of the pelvis in the world"""
-    rotations: Floats
-    """(T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world"""
-    contacts: Bools
-    """(T, 8) which of `CONTACT_JOINTS` rest on the floor"""
+    times: Floats  # (T,) seconds, evenly spaced
+    offsets: Floats  # (22, 3) metres, the bones
+    root: Floats  # (T, 3) metres, position of the pelvis in the world
+    rotations: Floats  # (T, 22, 3, 3) local rotations; the pelvis' rotation is its orientation in the world
+    contacts: Bools  # (T, 8) which of `CONTACT_JOINTS` rest on the floor
 
     @cached_property
     def _posed(self) -> tuple[Floats, Floats]:

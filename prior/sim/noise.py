@@ -126,8 +126,7 @@ class Errors:
 
 def draw_errors(travel: Floats, dt: Floats, rng: np.random.Generator, model: NoiseModel) -> Errors:
     """Sample the errors of a tracker, except for swaps, from the stationary distribution, by the metres (..., T, 22)
-    that each joint moved in the last ``dt`` (T,) seconds; the first ``dt`` is only used for the joints' speed.
-    """
+    that each joint moved in the last ``dt`` (T,) seconds; the first ``dt`` is only used for the joints' speed."""
     joint = (*travel.shape, 1)
     vector = (*travel.shape, 3)
     time = dt[:, None, None]
@@ -184,8 +183,7 @@ def _recursion(decay: Floats, source: Floats, gain: Floats | None = None) -> Flo
 
 def time_correlated(noise: Floats, memory: Floats | float, axis: int = 0) -> Floats:
     """Convert white noise, with frames along ``axis``, to a stationary AR(1) process of the same variance, in place.
-    ``memory`` is the correlation from one frame to the next; broadcasts against a frame.
-    """
+    ``memory`` is the correlation from one frame to the next; broadcasts against a frame."""
     frames = np.moveaxis(noise, axis, 0)
     for t in range(1, len(frames)):
         frames[t] = memory * frames[t - 1] + np.sqrt(1.0 - memory**2) * frames[t]

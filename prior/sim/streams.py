@@ -35,20 +35,13 @@ class ManifestError(ValueError):
 class Stream:
     """The recipe of one stream."""
 
-    name: str
-    """name of the stream and its directory"""
-    what: str
-    """description in one line"""
-    script: str
-    """a key of `prior.sim.scripts.SCRIPTS`"""
-    seed: int
-    """random seed of body, motion and noise"""
-    camera: Camera
-    """the camera"""
-    noise: Path = KINECT_NOISE
-    """file with the noise's parameters"""
-    seconds: float | None = None
-    """duration that is kept; the whole script if None"""
+    name: str  # name of the stream and its directory
+    what: str  # description in one line
+    script: str  # a key of `prior.sim.scripts.SCRIPTS`
+    seed: int  # random seed of body, motion and noise
+    camera: Camera  # the camera
+    noise: Path = KINECT_NOISE  # file with the noise's parameters
+    seconds: float | None = None  # duration that is kept; the whole script if None
 
 
 def read_manifest(path: Path) -> dict[str, Stream]:

@@ -50,8 +50,7 @@ class ConstantVelocityFilter:
 
     def update(self, positions: ArrayLike, stamp_s: float) -> Smoothed:
         """Process a frame (..., 3) metres, non-finite where missing, of an increasing stamp in seconds; returns its
-        estimate.
-        """
+        estimate."""
         measured = np.array(positions, dtype=np.float64)
         if self._stamp_s is None:
             self._joints = measured.shape[:-1]

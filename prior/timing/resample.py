@@ -88,8 +88,7 @@ class Resampler:
 
     def update(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
         """Process a frame (S, 22, 3) metres, NaN where unobserved, captured later than the last, and return the grid
-        frames that it completes, oldest first. A republished frame is ignored.
-        """
+        frames that it completes, oldest first. A republished frame is ignored."""
         if self._tick_ns is None:
             start_ns = stamp_ns if self._grid_ns is None else self._grid_ns
             self._tick_ns = start_ns - (start_ns - stamp_ns + LOOK_AHEAD_NS) // PERIOD_NS * PERIOD_NS

@@ -31,18 +31,12 @@ _NO_STANCE = Stance(np.zeros(4), np.zeros(4))
 class BodyEstimate:
     """The stages' estimates for one body of a message."""
 
-    observed: BodyObservation
-    """the input"""
-    contacts: Contacts
-    """predicted contacts"""
-    guessed: Bools
-    """(6,) which joints of legs (`LEG_CONTACTS`) are only guesses"""
-    stance: Stance
-    """feet that may anchor the root"""
-    root: RootState
-    """the filter's estimate of root and feet"""
-    feet: FeetState
-    """feet for publication"""
+    observed: BodyObservation  # the input
+    contacts: Contacts  # predicted contacts
+    guessed: Bools  # (6,) which joints of legs (`LEG_CONTACTS`) are only guesses
+    stance: Stance  # feet that may anchor the root
+    root: RootState  # the filter's estimate of root and feet
+    feet: FeetState  # feet for publication
 
 
 @dataclass

@@ -49,10 +49,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 class FeetState(NamedTuple):
     """Published feet."""
 
-    positions: Floats
-    """(4, 3) metres, world, positions of `FEET`; NaN where unknown"""
-    sigma: Floats
-    """(4,) metres, standard deviations along an axis"""
+    positions: Floats  # (4, 3) metres, world, positions of `FEET`; NaN where unknown
+    sigma: Floats  # (4,) metres, standard deviations along an axis
 
 
 class Feet:
@@ -88,8 +86,7 @@ class StillFeet:
 
     def update(self, estimates: Floats, sigma: Floats, rest: Floats, dt: float) -> Floats:
         """Return the published position of each foot from estimates (4, 3) metres, world, NaN where there is none,
-        their deviations (4,), the probabilities (4,) that they rest, and the seconds since the last call.
-        """
+        their deviations (4,), the probabilities (4,) that they rest, and the seconds since the last call."""
         moved = np.nan_to_num(estimates - self._before)
         offset = (self._offset - rest[:, None] * moved) * np.exp(-dt / EASE_S * (1.0 - rest))[:, None]
         length, most = np.linalg.norm(offset, axis=1), DEADBAND * np.nan_to_num(sigma)
@@ -140,8 +137,7 @@ class Soles:
     def learn(self, above: Floats, sigma: Floats, stands: Floats, dt: float) -> None:
         """Update the standing heights from observed heights (4,) above the floor, metres, NaN where foot or floor is
         unknown, their deviations (4,), the probabilities (4,) that feet stand, and seconds since the last frame, above
-        0.
-        """
+        0."""
         _learn(self._heights, self._variances, above, sigma, stands, max(MEMORY_S / dt, 1.0))
 
 

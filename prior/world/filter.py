@@ -85,8 +85,7 @@ class RootFilter:
         self, observed: BodyObservation, velocity: RootVelocity | None, stance: Stance, floor: Floor
     ) -> RootState:
         """Predict to the newest observation, and update with it, with the predicted root velocity if it is used, and
-        with the feet that may anchor the root; ``floor`` gives their height while the root is unobserved.
-        """
+        with the feet that may anchor the root; ``floor`` gives their height while the root is unobserved."""
         if observed.after_gap:
             for foot in range(len(FEET)):
                 self._kalman.lose(foot)

@@ -141,8 +141,7 @@ class Floor:
 
     def observe(self, sole: Floats, sigma: float, dt: float) -> None:
         """Update with the point (3,) metres, world, of one standing foot's sole, the deviation of its height, and the
-        seconds for which it has stood since the last update.
-        """
+        seconds for which it has stood since the last update."""
         height = float(sole[2])
         if not self.known:
             self.height, self._variance = height, sigma**2

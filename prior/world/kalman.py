@@ -143,14 +143,12 @@ class BodyFilter:
 
     def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
         """Update with an observed root position (3,) metres and the deviations of its errors: from frame to frame, and
-        slow.
-        """
+        slow."""
         self._correct({_POSITION: 1.0, _SENSOR: bias}, position, jitter)
 
     def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
         """Update with the network's root velocity (3,) m/s and the deviations, (3,) or a number, of its errors: from
-        frame to frame, and slow.
-        """
+        frame to frame, and slow."""
         self._correct({_VELOCITY: 1.0, _NETWORK: bias}, velocity, jitter)
 
     def observe_foot(self, foot: int, place: Floats, jitter: float, bias: float, *, from_root: bool) -> None:

@@ -36,10 +36,8 @@ _FOOT_CONTACTS = [CONTACT_JOINTS.index(joint) for joint in FEET]
 class RootVelocity(NamedTuple):
     """The predicted root velocity of a body, in the world."""
 
-    velocity: Floats
-    """(3,) m/s"""
-    sigma: Floats
-    """(3,) m/s, standard deviation, calibrated on validation"""
+    velocity: Floats  # (3,) m/s
+    sigma: Floats  # (3,) m/s, standard deviation, calibrated on validation
 
 
 @dataclass
@@ -67,8 +65,7 @@ class MotionMemory:
 
 class VelocityNetwork:
     """Predicts the root velocity of all bodies of a message at once. ``memory_s`` (3,) are time constants of its
-    errors.
-    """
+    errors."""
 
     def __init__(self, weights: str) -> None:
         self._net = LiveRootVelocity.load(weights)
@@ -101,10 +98,8 @@ class VelocityNetwork:
 class Stance(NamedTuple):
     """Feet that may anchor the root."""
 
-    load: Floats
-    """(4,) probabilities that `FEET` bear load; 0 for feet that may not anchor the root"""
-    rest: Floats
-    """(4,) probabilities that they rest; 0 likewise"""
+    load: Floats  # (4,) probabilities that `FEET` bear load; 0 for feet that may not anchor the root
+    rest: Floats  # (4,) probabilities that they rest; 0 likewise
 
 
 def stance(contacts: Contacts, observed: BodyObservation, feet_off: Floats) -> Stance:
@@ -135,8 +130,7 @@ class ContactNetwork:
         floor: Floor,
     ) -> list[Contacts]:
         """Predict each body's load (8,), rest (8,) and new hidden state (hidden,), from its hidden state and its
-        observation of ``before``. After a gap, motion starts anew.
-        """
+        observation of ``before``. After a gap, motion starts anew."""
         if not observed:
             return []
         states = [np.zeros_like(s) if now.after_gap else s for s, now in zip(states, observed, strict=True)]

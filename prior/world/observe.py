@@ -111,8 +111,7 @@ def observe(
     last: Mapping[int, BodyObservation],
 ) -> list[BodyObservation]:  # fmt: skip
     """Convert the bodies of a message, each id once, to observations in the world, in which the sensor has this
-    orientation (4,) xyzw and position (3,) metres. ``last`` is each body's last observation, by id.
-    """
+    orientation (4,) xyzw and position (3,) metres. ``last`` is each body's last observation, by id."""
     if not bodies:
         return []
     positions = np.array([body.positions for body in bodies], dtype=np.float64)

@@ -133,8 +133,7 @@ class MotionSet:
 
 class SpeedWeightedWindows:
     """Draws windows of motion with weights that grow with speed, and each source by the square root of its size: a
-    large source of ten exercises would outweigh all others. Without given sources, all clips are one.
-    """
+    large source of ten exercises would outweigh all others. Without given sources, all clips are one."""
 
     def __init__(self, motion: MotionSet) -> None:
         lengths = np.diff(motion.clip_start)

@@ -111,8 +111,7 @@ class HGVAE(nn.Module):
     def completed(self, x: Tensor, observed: Tensor, bias_sigma: NDArray[np.floating] | float) -> tuple[Tensor, Tensor]:
         """Complete unobserved entries of tracks (B, N, T), which hold the interpolation of `features.to_tracks`;
         returns windows (B, N, T) and the certainty (B, N, T) of each entry. ``bias_sigma`` (B,) is the sensor's bias,
-        metres along an axis.
-        """
+        metres along an axis."""
         if self.completion is None:
             return x, observed
         completed, log_var = self.completion.complete(x, observed, bias_sigma)

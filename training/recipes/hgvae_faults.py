@@ -81,8 +81,7 @@ REPEATED = 0.15  # share of the windows in which a tracker repeats its last outp
 
 def train_anomaly(path: Path, iterations: int, options: TrainingOptions) -> None:
     """Train the fault network of the HG-VAE at ``path``, calibrate it on validation motion, and write both beside it.
-    ``options`` are HG-VAE's, except that ``start`` names weights of a fault network.
-    """
+    ``options`` are HG-VAE's, except that ``start`` names weights of a fault network."""
     weights, seed = options.weights, options.seed
     model = load_network(HGVAE, HGVAEConfig.from_dict, str(path), "hgvae")
     train, val = (Windows(motion) for motion in options.motion())

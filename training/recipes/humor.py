@@ -142,8 +142,7 @@ def _fit_statistics(model: HumorNet, sequences: Sequences, seed: int) -> None:
 
 def fit_initial(model: HumorNet, inputs: Tensor, seed: int) -> None:
     """Fit the model's mixture of initial states (HuMoR, section 3) by expectation-maximisation, to standardised
-    features (N, `FEATURES`) of states in their canonical frames.
-    """
+    features (N, `FEATURES`) of states in their canonical frames."""
     from sklearn.mixture import GaussianMixture  # in the extra `train`, and slow to import
 
     mixture = GaussianMixture(

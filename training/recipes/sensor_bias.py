@@ -119,8 +119,7 @@ def train_sensor(takes: Sequence[SensorTake], options: TrainingOptions) -> Path:
 
 def leave_one_person_out(takes: Sequence[SensorTake], options: TrainingOptions) -> Iterator[HeldOut]:
     """Yield every person's error with a correction learned from all others, which a new person can expect.
-    ``options.runs`` is a folder without runs.
-    """
+    ``options.runs`` is a folder without runs."""
     for number, person in enumerate(sorted({take.person for take in takes})):
         others = [take for take in takes if take.person != person]
         path = train_sensor(others, replace(options, weights=f"without-{number}"))

@@ -23,14 +23,10 @@ class Level(NamedTuple):
 class CompletionConfig:
     """Sizes of the completion network."""
 
-    patch: int = 5
-    """frames in a node; a window consists of whole patches"""
-    width: int = 256
-    """number of features of each node"""
-    heads: int = 8
-    """number of attention heads"""
-    layers: int = 5
-    """number of attention layers between the input and the output layer"""
+    patch: int = 5  # frames in a node; a window consists of whole patches
+    width: int = 256  # number of features of each node
+    heads: int = 8  # number of attention heads
+    layers: int = 5  # number of attention layers between the input and the output layer
 
 
 @dataclass(frozen=True)
@@ -70,10 +66,8 @@ class HGVAEConfig:
 class FaultNetConfig:
     """Sizes of the fault network."""
 
-    frames: int = 50
-    """T, frames of HG-VAE's window"""
-    features: int = 48
-    """number of features of each of its 66 nodes"""
+    frames: int = 50  # T, frames of HG-VAE's window
+    features: int = 48  # number of features of each of its 66 nodes
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> FaultNetConfig:

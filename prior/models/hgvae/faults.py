@@ -116,8 +116,7 @@ class LiveFaultNet:
 class Calibration:
     """Scores of clean windows, by missing joints, sensor error and pace."""
 
-    quantiles: Floats
-    """(M, S, P, R) quantiles of the window's score at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`"""
+    quantiles: Floats  # (M, S, P, R) quantiles of the window's score at `MISSING`, `SENSOR_SIGMAS`, `PACES` and `RATES`
 
     @classmethod
     def load(cls, weights: str) -> Calibration:
@@ -137,8 +136,7 @@ class Calibration:
 
     def limits(self, missing: NDArray[np.integer], sensor_sigma: Floats, paces: Floats) -> Floats:
         """Return the scores (B, R) of clean windows at `RATES`, interpolated between the measured conditions: numbers
-        of missing joints (B,), errors of the sensor (B,) metres along an axis, and `pace`s (B,) m/s.
-        """
+        of missing joints (B,), errors of the sensor (B,) metres along an axis, and `pace`s (B,) m/s."""
         by_missing = _interpolation_weights(np.asarray(missing, dtype=np.float64), np.array(MISSING, dtype=np.float64))
         by_sensor = _interpolation_weights(np.log(sensor_sigma), np.log(SENSOR_SIGMAS))
         by_pace = _interpolation_weights(np.log(np.maximum(paces, 1e-3)), np.log(PACES))
@@ -160,16 +158,14 @@ def pace(mean: Floats) -> Floats:
 
 def joint_odds(odds: Floats, observed: Floats, frozen: NDArray[np.bool_]) -> Floats:
     """Adjust the fault network's log odds (B, 22) for frozen joints (B, 22), whose last position the sensor repeats;
-    -inf for joints that are not observed (B, 66, T) in the scored frames.
-    """
+    -inf for joints that are not observed (B, 66, T) in the scored frames."""
     seen = (observed[:, ::3, -RECENT:] > 0).any(axis=-1)
     return np.where(seen, np.where(frozen, np.maximum(odds, FROZEN_ODDS), odds), -np.inf)
 
 
 def decimals(score: Floats, limits: Floats) -> Floats:
     """Return -log10 of the rate at which clean windows score at least as high as ``score`` (B, K), by limits (B, R) of
-    `Calibration.limits`.
-    """
+    `Calibration.limits`."""
     anomaly = np.empty(score.shape)
     _decimals(score, limits, -np.log10(RATES), anomaly)
     return anomaly

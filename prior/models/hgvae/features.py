@@ -46,8 +46,7 @@ def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
     """Convert windows (..., T, 22, 3) metres, z up, NaN where missing, of bodies of these sizes (...) (`body_size`) to
-    tracks.
-    """
+    tracks."""
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
     sizes = np.empty(batch)
@@ -85,8 +84,7 @@ def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floatin
 
 def hang_unseen(deviations: NDArray[np.floating]) -> None:
     """Fill in joints that were never observed (NaN) in ``deviations`` (..., 66, T) from the mean tracks, in place: each
-    gets its parent's deviation.
-    """
+    gets its parent's deviation."""
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
 

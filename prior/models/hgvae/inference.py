@@ -17,16 +17,13 @@ from steadypose.prior.models.weights import Arrays, load_weights, part
 class Reconstruction(NamedTuple):
     """The distribution p(x | z) of windows."""
 
-    mean: NDArray[np.float64]
-    """(..., 66, T) metres of a body of standard size, tracks"""
-    sigma: NDArray[np.float64]
-    """(..., 66, T) metres, standard deviations"""
+    mean: NDArray[np.float64]  # (..., 66, T) metres of a body of standard size, tracks
+    sigma: NDArray[np.float64]  # (..., 66, T) metres, standard deviations
 
 
 class LiveHGVAE:
     """A trained `HGVAE`, without actions, at the means of its latents, for windows of ``frames`` (T) and at most
-    ``max_batch`` windows per call.
-    """
+    ``max_batch`` windows per call."""
 
     def __init__(self, config: HGVAEConfig, weights: Arrays, max_batch: int) -> None:
         p = Program()
@@ -74,8 +71,7 @@ class LiveHGVAE:
         self, x: NDArray[np.float64], observed: NDArray[np.float64], bias_sigma: NDArray[np.float64]
     ) -> Reconstruction:
         """Encode and decode windows `Tracks.x` (B, 66, T) metres of a body of standard size, NaN for a joint never
-        observed; ``bias_sigma`` (B,) is the sensor's bias, metres along an axis.
-        """
+        observed; ``bias_sigma`` (B,) is the sensor's bias, metres along an axis."""
         rows = slice(0, len(x))
         deviations = (x - self._mean) / SCALE
         hang_unseen(deviations)

@@ -73,8 +73,7 @@ class MixtureSmoother:
     def update(self, positions: Floats, stamp_s: float, confidence: Floats | None = None) -> Smoothed | None:
         """Process a frame (S, 22, 3) metres, world-aligned with z up, NaN where unobserved, of an increasing stamp in
         seconds, and return the estimate of the frame ``delay`` earlier, or None if there is none yet. ``confidence``
-        (S, 22) is 1 if omitted.
-        """
+        (S, 22) is 1 if omitted."""
         step = stamp_s - self._stamps[-1] if self._stamps else 1 / FPS
         certainty = np.ones((self._slots, 22)) if confidence is None else confidence
         self._note(stamp_s)

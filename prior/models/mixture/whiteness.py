@@ -121,6 +121,5 @@ def _update(positions, last, step, frames, mean, variance, change, pairs, undone
 
 def fallback(white: Floats, scale: Floats, delay: int) -> Floats:
     """Return the weight (S,) of the multiple-model estimate, by the share of the noise that is white (S,), the
-    estimated noise (S,) metres along an axis, and the smoother's look-ahead in frames.
-    """
+    estimated noise (S,) metres along an axis, and the smoother's look-ahead in frames."""
     return np.minimum(white, 0.5 + 0.5 / (1.0 + np.square(scale / (LARGE if delay else LARGE_NEWEST))))
