@@ -41,8 +41,7 @@ _WARNED = "STEADYPOSE_UNCACHED"
 _DIGEST = hashlib.sha256().digest_size
 
 saved: set[str] = set()  # names of the entries that this process has compiled and written
-watchers: list[Callable[[str], None]] = []
-"""Functions that are called with the name of each entry when it is loaded or compiled."""
+watchers: list[Callable[[str], None]] = []  # functions called with the name of each entry that is loaded or compiled
 
 
 def folders() -> list[Path]:
@@ -152,14 +151,14 @@ def load(name: str, key: object) -> Any | None:
             if content is None:
                 logger.warning("steadypose: %s is damaged; compiling it anew", folder / name)
                 continue
-            found, entry = pickle.loads(content)
+            saved_key, entry = pickle.loads(content)
         except FileNotFoundError:
             continue
         except Exception as error:  # unpickling raises many kinds, and a cache entry is not essential
             logger.warning("steadypose: %s cannot be used (%s); compiling it anew", folder / name, error)
             continue
-        if found == key:
-            _tell(name)
+        if saved_key == key:
+            _notify_watchers(name)
             return entry
     return None
 
@@ -173,7 +172,7 @@ def save(name: str, data: bytes) -> None:
         with suppress(OSError):
             _write(folder / name, hashlib.sha256(data).digest() + data)
             saved.add(name)
-    _tell(name)
+    _notify_watchers(name)
 
 
 @cache
@@ -183,7 +182,7 @@ def announce() -> None:
         logger.warning("steadypose: compiling loops for this processor, once")
 
 
-def _tell(name: str) -> None:
+def _notify_watchers(name: str) -> None:
     for watcher in watchers:
         watcher(name)
 
@@ -215,11 +214,11 @@ def warn_uncached(say: Callable[[str], None]) -> None:
 @cache
 def digest(loop: Any) -> str:
     """Return a digest of what a dispatcher is compiled from: its code, and the constants and loops that it names."""
-    function, found = loop.py_func, hashlib.sha256()
-    for part in _parts(function, loop):
-        found.update(part.encode() + b"\0")
-    found.update(repr(sorted(loop.targetoptions.items())).encode())
-    return found.hexdigest()
+    hasher = hashlib.sha256()
+    for part in _parts(loop.py_func, loop):
+        hasher.update(part.encode() + b"\0")
+    hasher.update(repr(sorted(loop.targetoptions.items())).encode())
+    return hasher.hexdigest()
 
 
 def _parts(function: FunctionType, loop: object) -> Iterator[str]:

@@ -76,15 +76,15 @@ def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:
                 raise ValueError(f"{name}: expected a section, got {value!r}")
             values[key] = build_settings(type(default), value, f"{path}.{key}".lstrip("."))
             continue
-        wanted = type(default)
-        if not _is_of(wanted, value):
-            kind = "true or false" if wanted is bool else f"{wanted.__name__} such as {default!r}"
+        expected = type(default)
+        if not _is_of(expected, value):
+            kind = "true or false" if expected is bool else f"{expected.__name__} such as {default!r}"
             raise ValueError(f"{name}: expected {kind}, got {value!r}")
-        if wanted is float and not math.isfinite(value):
+        if expected is float and not math.isfinite(value):
             raise ValueError(f"{name}: expected a finite number such as {default!r}, got {value!r}")
         if isinstance(value, (list, dict)) and (kind := _kind_of_items(cls, key)) is not None:
             _check_items(name, value, kind)
-        values[key] = wanted(value)  # type: ignore[arg-type]  (it is of that type)
+        values[key] = expected(value)  # type: ignore[arg-type]  (it is of that type)
     return cls(**values)
 
 

@@ -39,7 +39,7 @@ LENGTH_BIASES = 3.0
 """Least error of a single sample of a bone, as a multiple of the sensor's bias. Successive samples share most of it."""
 
 LIKE_SAMPLES = 12
-"""Correlation time of the samples' errors, samples (two seconds): that many count as one independent sample."""
+"""Correlation time of the samples' errors, samples (two seconds): this number counts as one independent sample."""
 
 _LIMBS_MIDDLES = {joint for joint, name in enumerate(JOINTS) if name.endswith(("elbow", "knee"))}
 _COLLAR_TO_SHOULDER = SHOULDERS[0] - COLLARS[0]
@@ -71,9 +71,9 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
     counts = np.array([len(positions), max(samples, len(positions))])
     same = 1.0 + counts / LIKE_SAMPLES
     bias, noise = LENGTH_BIASES * bias_sigma, np.sqrt(2.0) * noise_sigma
-    seen = np.asarray(finite_joints(positions).any(axis=0))
-    seen |= seen[MIRROR]
-    bones = _both_sides(_bones(seen))
+    observed = np.asarray(finite_joints(positions).any(axis=0))
+    observed |= observed[MIRROR]
+    bones = _both_sides(_bones(observed))
     log_ratio, sigma = np.zeros(len(bones)), np.full((2, len(bones)), np.inf)  # now, and in the end
     for k, paths in enumerate(bones):
         generic = float(np.linalg.norm(REST_OFFSETS[paths[0]].sum(axis=0)))
@@ -98,27 +98,27 @@ def estimate_bones(positions: Floats, bias_sigma: float, noise_sigma: float, sam
         offsets[np.concatenate(paths)] *= factor
         to_learn[np.concatenate(paths)] = max(now - then, 0.0)
     length_variance = to_learn * (offsets**2).sum(axis=-1)
-    doubt = bias**2 / same + noise**2 / counts
-    weight_measured = TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + doubt)
+    error = bias**2 / same + noise**2 / counts
+    weight_measured = TRUNK_PLACE_SPREAD**2 / (TRUNK_PLACE_SPREAD**2 + error)
     length_variance[_ON_TRUNK] = TRUNK_PLACE_SPREAD**2 * (weight_measured[1] - weight_measured[0])
-    return BoneEstimate(_place_on_trunk(positions, seen, offsets, weight_measured[0]), length_variance)
+    return BoneEstimate(_place_on_trunk(positions, observed, offsets, weight_measured[0]), length_variance)
 
 
 _TRUNKS = ((J["pelvis"], (J["left_hip"],)), (J["spine3"], (J["neck"], J["left_collar"])))
 _ON_TRUNK = sorted({int(end) for _, joints in _TRUNKS for joint in joints for end in (joint, MIRROR[joint])})
 
 
-def _bones(seen: Bools) -> list[list[int]]:
-    """Return the measurable bones, given the joints (22,) that were ever ``seen``.
+def _bones(observed: Bools) -> list[list[int]]:
+    """Return the measurable bones, given the joints (22,) that were ever ``observed``.
 
     Each bone is the path of joints from an observed joint up to, but without, its nearest observed ancestor.
     """
     measurable = []
     for joint in range(1, len(PARENTS)):
         path = [joint]
-        while PARENTS[path[-1]] > 0 and not seen[PARENTS[path[-1]]]:
+        while PARENTS[path[-1]] > 0 and not observed[PARENTS[path[-1]]]:
             path.append(PARENTS[path[-1]])
-        if seen[joint] and seen[PARENTS[path[-1]]]:
+        if observed[joint] and observed[PARENTS[path[-1]]]:
             measurable.append(path)
     return measurable
 
@@ -131,7 +131,7 @@ def _both_sides(paths: list[list[int]]) -> list[list[list[int]]]:
     return list(pairs.values())
 
 
-def _place_on_trunk(positions: Floats, seen: Bools, offsets: Floats, weight: float) -> Floats:
+def _place_on_trunk(positions: Floats, observed: Bools, offsets: Floats, weight: float) -> Floats:
     """Return offsets (22, 3) with hips, neck and collars moved by ``weight`` towards the samples (T, 22, 3)."""
     placed = offsets.copy()
     world = global_rotations(solve_rotations(positions, offsets))
@@ -139,7 +139,7 @@ def _place_on_trunk(positions: Floats, seen: Bools, offsets: Floats, weight: flo
         for joint in children:
             both = []
             for end, side in ((joint, 1.0), (int(MIRROR[joint]), -1.0)):
-                beyond = 0 if seen[end] or joint != J["left_collar"] else _COLLAR_TO_SHOULDER
+                beyond = 0 if observed[end] or joint != J["left_collar"] else _COLLAR_TO_SHOULDER
                 vectors = np.einsum("tji,tj->ti", world[:, trunk], positions[:, end + beyond] - positions[:, trunk])
                 vectors -= offsets[end + beyond] if beyond else 0.0
                 both.append(vectors[finite_joints(vectors)] * [1.0, side, 1.0])
@@ -172,19 +172,19 @@ def estimate_offsets(positions: NDArray[np.floating]) -> Floats:
     """
     p = np.asarray(positions, dtype=np.float64)
     offsets = REST_OFFSETS.copy()
-    seen = np.asarray(finite_joints(p).any(axis=0))
+    observed = np.asarray(finite_joints(p).any(axis=0))
     ratios: list[float] = []
-    for path in sorted(_bones(seen), key=_around_shoulder):
+    for path in sorted(_bones(observed), key=_around_shoulder):
         lengths = np.linalg.norm(p[:, path[0]] - p[:, PARENTS[path[-1]]], axis=-1)
         lengths = lengths[np.isfinite(lengths)] / np.linalg.norm(REST_OFFSETS[path].sum(axis=0))
         if len(lengths):
             ratios.append(float(np.percentile(lengths, STRAIGHT if _LIMBS_MIDDLES & {*path[1:]} else 50.0)))
-            # arms hang, so that collar and elbow are never as far apart as their bones are long
+            # with hanging arms, collar and elbow are closer together than the sum of their bones' lengths
             offsets[path] *= np.median(ratios[:-1]) if _around_shoulder(path) and len(ratios) > 1 else ratios[-1]
     world = global_rotations(solve_rotations(p, offsets))
     for trunk, children in ((J["pelvis"], HIPS), (J["spine3"], (J["neck"], *COLLARS))):
         for joint in children:
-            end = joint if joint not in COLLARS or seen[joint] else joint + _COLLAR_TO_SHOULDER
+            end = joint if joint not in COLLARS or observed[joint] else joint + _COLLAR_TO_SHOULDER
             vectors = np.einsum("tji,tj->ti", world[:, trunk], p[:, end] - p[:, trunk])
             usable = finite_joints(vectors)
             if usable.any():

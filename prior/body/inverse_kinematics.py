@@ -135,8 +135,8 @@ def fit_lengths(
 
     `solve_pose` follows the chain, so the whole error of a bone's length moves the joint at its end and all joints
     below. Here, every bone and every rigid segment of the trunk pulls at both its ends until the lengths match, by
-    Gauss-Newton sweeps over the distances (position-based dynamics, Müller et al. 2007). Uncertain lengths yield
-    according to their variance (compliant constraints, XPBD, Macklin et al. 2016).
+    Gauss-Newton sweeps over the distances (position-based dynamics, Müller et al. 2007). Uncertain lengths are
+    compliant constraints, with their variance as the compliance (XPBD, Macklin et al. 2016).
 
     Args:
         positions: (..., 22, 3) metres, all finite.
@@ -181,26 +181,26 @@ def _write_rest(offsets, rest):
 
 
 @njit(cache=True)
-def _pelvis(p, seen, rest):
+def _pelvis(p, observed, rest):
     """The pelvis: observed, between the hips, or upright below the best observed point of the trunk."""
-    if seen[0]:
+    if observed[0]:
         return point(p, 0)
     for k in range(len(_BELOW)):
-        if seen[_BELOW[k, 0]] and seen[_BELOW[k, 1]]:
+        if observed[_BELOW[k, 0]] and observed[_BELOW[k, 1]]:
             place = middle_of(p, _BELOW[k])
             return place[0], place[1], place[2] - middle_of(rest, _BELOW[k])[2]
     return 0.0, 0.0, 0.0
 
 
 @njit(cache=True)
-def _write_trunk(which, p, seen, rest, here, above, out):
+def _write_trunk(which, p, observed, rest, here, above, out):
     """Write the rotation of pelvis (0) or chest (1), local to its parent's ``above``, if this frame determines it."""
     joint = _RIGID_PARTS[which]
     for k in range(len(_PART_LEFT[which])):
         left, right = _PART_LEFT[which, k]
         for m in range(len(_PART_UP[which])):
             a, b = _PART_UP[which, m]
-            if seen[left] and seen[right] and seen[a] and seen[b]:
+            if observed[left] and observed[right] and observed[a] and observed[b]:
                 shown = frame_axes(difference(point(p, left), point(p, right)), difference(middle_of(p, (a, b)), here))
                 resting = frame_axes(
                     difference(point(rest, left), point(rest, right)),
@@ -240,13 +240,13 @@ def _constrain(positions, offsets, mobility, length_variance):
 
 
 @njit(cache=True)
-def _twist(joint, p, seen, above, turn, bone):
+def _twist(joint, p, observed, above, turn, bone):
     """Return the angle about unit ``bone`` (parent's frame) by which to twist ``turn``.
 
     It makes the hinge axis normal to the plane of the limb, as far as the limb is bent.
     """
     middle, end = _AIM[joint, 0], _AIM[joint, 1]
-    if not (seen[middle] and seen[end]):
+    if not (observed[middle] and observed[end]):
         return 0.0
     normal = cross(bone, normalised(rotated_back(above, difference(point(p, end), point(p, middle)))))
     share = (math.sqrt(dot(normal, normal)) - _BEND_NONE) / (_BEND_FULL - _BEND_NONE)
@@ -257,7 +257,7 @@ def _twist(joint, p, seen, above, turn, bone):
 
 
 @njit(cache=True)
-def _solve(positions, observed, offsets, local, placed, root_known):
+def _solve(positions, known, offsets, local, placed, root_known):
     """Write ``placed`` (B, 22, 3) and the solvable part of ``local`` (B, 22, 3, 3); the root unless ``root_known``."""
     joints = len(PARENT)
     rest = np.empty((joints, 3))
@@ -265,11 +265,11 @@ def _solve(positions, observed, offsets, local, placed, root_known):
     turn, twist = np.empty((3, 3)), np.empty((3, 3))
     upright = np.eye(3)
     for frame in range(len(positions)):
-        p, seen, bones = positions[frame], observed[frame], offsets[frame]
+        p, observed, bones = positions[frame], known[frame], offsets[frame]
         _write_rest(bones, rest)
         for joint in range(joints):
             if joint == 0:
-                above, here = upright, _pelvis(p, seen, rest)
+                above, here = upright, _pelvis(p, observed, rest)
             else:
                 above = world[PARENT[joint]]
                 bone = rotated(above, point(bones, joint))
@@ -279,14 +279,14 @@ def _solve(positions, observed, offsets, local, placed, root_known):
                 placed[frame, joint, i] = here[i]
             for which in range(len(_RIGID_PARTS)):
                 if joint == _RIGID_PARTS[which] and not (root_known and joint == 0):
-                    _write_trunk(which, p, seen, rest, here, above, local[frame, joint])
+                    _write_trunk(which, p, observed, rest, here, above, local[frame, joint])
             for k in range(_AIM.shape[1]):
                 target = _AIM[joint, k]
-                if target >= 0 and seen[target]:
+                if target >= 0 and observed[target]:
                     direction = rotated_back(above, difference(point(p, target), here))
                     write_swing(difference(point(rest, target), point(rest, joint)), direction, turn)
                     direction = normalised(direction)
-                    angle = _twist(joint, p, seen, above, turn, direction) if _HINGED[joint] else 0.0
+                    angle = _twist(joint, p, observed, above, turn, direction) if _HINGED[joint] else 0.0
                     write_rotation(direction, math.sin(angle), math.cos(angle), 1.0 - math.cos(angle), twist)
                     write_product(twist, turn, local[frame, joint])
                     break

@@ -6,9 +6,9 @@ stays unobserved. The bundled layouts are in ``layouts.toml``, in the same form 
     [skeletons.gym16]
     joints = ["head", "left_shoulder", "l_elbow", ...] # in the order of the messages
 
-    [skeletons.gym16.canonical]                        # of those that are called otherwise than in smpl22
+    [skeletons.gym16.canonical]                        # only joints that have other names than in smpl22
     left_elbow = "l_elbow"
-    spine3 = ["left_shoulder", "right_shoulder"]       # the middle of several
+    spine3 = ["left_shoulder", "right_shoulder"]       # the mean of several joints
 
 A canonical joint without an entry is the sensor joint of the same name, if there is one. Pelvis and neck may also be
 interpolated between the midpoints of hips and shoulders, and the head may be the midpoint of the ears.
@@ -47,8 +47,8 @@ INTERPOLATED = {"pelvis", "neck"}
 """Canonical joints that `middles` interpolates; a head is in the middle of the ears."""
 
 INTERPOLATED_SIGMA = 0.025
-"""Standard deviation along an axis of a pelvis or neck that is interpolated, metres. The error of validation people's
-is 17 and 34 mm (mean distance)."""
+"""Standard deviation along an axis of a pelvis or neck that is interpolated, metres. Their mean errors on validation
+people are 17 and 34 mm."""
 
 NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")  # canonical joints that every layout must have
 

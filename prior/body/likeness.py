@@ -63,10 +63,10 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
     a layout of J joints. None if too few joints were observed."""
     joints, _ = to_canonical(skeleton, positions.astype(np.float64))
     lengths = np.linalg.norm(joints[:, SPANS[:, 0]] - joints[:, SPANS[:, 1]], axis=-1)
-    seen = np.isfinite(lengths).sum(axis=0) > len(lengths) / 4
-    if seen.sum() < MIN_SPANS:
+    observed = np.isfinite(lengths).sum(axis=0) > len(lengths) / 4
+    if observed.sum() < MIN_SPANS:
         return None
-    logs = np.log(np.maximum(lengths[:, seen] / HUMAN[seen], NO_LENGTH))
+    logs = np.log(np.maximum(lengths[:, observed] / HUMAN[observed], NO_LENGTH))
     middle = medians(logs)
     scale = float(np.median(middle))
     spread = np.minimum(medians(np.abs(logs - middle)), 1.0)
@@ -76,7 +76,7 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
         skeleton.name,
         float(np.exp(scale)),
         float(np.sqrt(np.mean(off**2 + spread**2))),
-        SPAN_NAMES[int(np.flatnonzero(seen)[worst])],
+        SPAN_NAMES[int(np.flatnonzero(observed)[worst])],
         float(np.exp(off[worst])),
     )
 
@@ -84,8 +84,8 @@ def likeness(skeleton: Skeleton, positions: NDArray[np.floating]) -> Likeness | 
 def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
     """Return the fits of all layouts with this number of joints, best first."""
     fitting = [s for s in SKELETONS.values() if len(s.joints) == positions.shape[1]]
-    found = [like for skeleton in fitting if (like := likeness(skeleton, positions))]
-    return sorted(found, key=lambda like: like.error)
+    likenesses = [like for skeleton in fitting if (like := likeness(skeleton, positions))]
+    return sorted(likenesses, key=lambda like: like.error)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def stance(skeleton: Skeleton, positions: NDArray[np.floating]) -> Stance | None
     if not len(ups):
         return None
     up = ups.mean(axis=0)
-    if np.linalg.norm(up) < 0.9:  # no common direction: somebody falls, or the joints form no body
+    if np.linalg.norm(up) < 0.9:  # no common direction: a body falls, or the joints form none
         return None
     return Stance(up / np.linalg.norm(up), _handedness(skeleton, positions, joints))
 
@@ -140,9 +140,9 @@ def _handedness(skeleton: Skeleton, positions: Floats, joints: Floats) -> float:
 def _mean(joints: Floats, *names: str) -> Floats:
     """(T, 3) mean of the observed joints among these; NaN if none is observed."""
     chosen = joints[:, [J[name] for name in names]]
-    seen = finite_joints(chosen)
-    total = np.where(seen[..., None], chosen, 0.0).sum(axis=1)
-    counts = seen.sum(axis=1)[:, None]
+    observed = finite_joints(chosen)
+    total = np.where(observed[..., None], chosen, 0.0).sum(axis=1)
+    counts = observed.sum(axis=1)[:, None]
     return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
 

@@ -60,7 +60,7 @@ usual direction is forgotten, seconds."""
 _TURN_KEPT = math.exp(-1.0 / (TURN_MEMORY_S * FPS))
 
 CORRELATED = 60.0
-"""Number of frames that count as one in the estimate of the usual direction, because noise and posture last, frames."""
+"""Number of frames that count as one in the estimate of the usual direction: noise and posture are time-correlated."""
 
 MAX_SIGMA = 0.5  # standard deviation of an unknown joint, metres
 _LEAST_LENGTH = 0.03  # least length of a bone, metres

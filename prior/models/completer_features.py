@@ -3,8 +3,8 @@
 The estimate is the sum of three parts. The *line* interpolates each joint between its known frames, rotations by slerp
 and the root by lerp. A joint that is known on one side only is held; a joint that is never known has the mean pose. The
 *bend* is the natural cubic spline through the known frames, minus the line; the network outputs a gate for it. The
-*correction* is the rest of the network's output, minus the line through its values at known frames (`anchored`). It
-vanishes at known frames, so there is no step. In short gaps little is taken from the network (`correction_share`).
+*correction* is the rest of the network's output, minus the line through its values at known frames (`anchored`), so it
+is zero at known frames, and the motion is continuous. In short gaps, a small share of it is used (`correction_share`).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class CompleterConfig:
         """Build the configuration from the JSON of a weights file; raises WeightsError for an earlier version's."""
         if "far_sigma" not in config:
             raise WeightsError(
-                "completer: expected weights of this version, which states errors otherwise: train again"
+                "completer: expected weights of this version, which have an error for each joint: train again"
             )
         return cls(**{**config, "far_sigma": tuple(config["far_sigma"])})
 
@@ -117,44 +117,50 @@ def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple
     fallback[..., _SPINE, :, :] = usual[_SPINE]
     fallback[..., _LEAVES, :, :] = np.eye(3)
     rotations = solve_rotations(positions, offsets, fallback)
-    found = known & np.isfinite(rotations).all(axis=(-1, -2))
+    determined = known & np.isfinite(rotations).all(axis=(-1, -2))
     chest = np.isfinite(rotations[..., J["spine3"], :, :]).all(axis=(-1, -2))
     for joint, children in enumerate(CHILDREN):
         if joint == 0:
-            found[..., 0] &= known[..., HIPS].all(axis=-1)
+            determined[..., 0] &= known[..., HIPS].all(axis=-1)
         elif joint in _SPINE or joint == J["spine3"]:
-            found[..., joint] = chest & found[..., 0]
+            determined[..., joint] = chest & determined[..., 0]
         else:
-            found[..., joint] &= found[..., PARENTS[joint]]
+            determined[..., joint] &= determined[..., PARENTS[joint]]
             for child in children:
-                found[..., joint] &= known[..., child]
-    _interpolate_twist(rotations, found, known, np.broadcast_to(offsets, positions.shape))
-    return rotations, found
+                determined[..., joint] &= known[..., child]
+    _interpolate_twist(rotations, determined, known, np.broadcast_to(offsets, positions.shape))
+    return rotations, determined
 
 
-def _interpolate_twist(rotations: Floats, found: Bools, known: Bools, offsets: Floats) -> None:
+def _interpolate_twist(rotations: Floats, determined: Bools, known: Bools, offsets: Floats) -> None:
     """Interpolate, in place, the twist of upper arms and thighs over frames in which wrist or ankle are unknown.
 
-    The bend of elbow or knee shows the twist, and the forearm's or shank's local rotation is relative to it. Without
-    this, that rotation, interpolated between the known frames, would point elsewhere.
+    The bend of elbow or knee shows the twist, which the local rotation of forearm or shank is relative to. With a wrong
+    twist, this rotation, interpolated between the known frames, would have a wrong direction in the world.
     """
     balls, middles, ends = _HINGED_LIMBS.T
-    shape = (-1, found.shape[-2], len(balls))
-    aimed, shown = found[..., balls].reshape(shape), known[..., ends].reshape(shape)
-    told = aimed & shown
-    missing = aimed & ~shown & told.any(axis=1, keepdims=True)
+    shape = (-1, determined.shape[-2], len(balls))
+    aimed, shown = determined[..., balls].reshape(shape), known[..., ends].reshape(shape)
+    twist = aimed & shown
+    missing = aimed & ~shown & twist.any(axis=1, keepdims=True)
     if not missing.any():
         return
-    solved, line = rotations[..., balls, :, :].reshape(*told.shape, 3, 3), draw_line(told)
-    turns, twisted = quaternions(np.where(told[..., None, None], solved, np.eye(3))), np.zeros((*told.shape, 4))
+    solved, line = rotations[..., balls, :, :].reshape(*twist.shape, 3, 3), draw_line(twist)
+    turns, twisted = (
+        quaternions(np.where(twist[..., None, None], solved, np.eye(3))),
+        np.zeros((*twist.shape, 4)),
+    )
     write_slerp(turns, line.before, line.after, line.weight, line.ever, np.zeros((len(balls), 4)), twisted)
-    before, bones = rotation_matrices(twisted[missing]), offsets[..., middles, :].reshape(*told.shape, 3)[missing]
+    before, bones = (
+        rotation_matrices(twisted[missing]),
+        offsets[..., middles, :].reshape(*twist.shape, 3)[missing],
+    )
     now, then = (_unit((turn @ bones[..., None])[..., 0]) for turn in (solved[missing], before))
     axis = np.cross(then, now)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
     angle = np.arctan2(sine, (then * now).sum(axis=-1, keepdims=True))
     solved[missing] = from_rotation_vectors(axis * (angle / np.maximum(sine, 1e-9))) @ before
-    rotations[..., balls, :, :] = solved.reshape(*found.shape[:-1], len(balls), 3, 3)
+    rotations[..., balls, :, :] = solved.reshape(*determined.shape[:-1], len(balls), 3, 3)
 
 
 def _unit(vectors: Floats) -> Floats:

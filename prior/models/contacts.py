@@ -34,7 +34,7 @@ def contact_features(
     dt: Floats | float,
     yaw: NDArray[np.floating],
     sigma: NDArray[np.floating],
-    root_seen: Floats,
+    root_observed: Floats,
     ground: Floats,
 ) -> Floats32:
     """Build the features (B, `FEATURES`) of B frames.
@@ -45,7 +45,7 @@ def contact_features(
         dt: (B,) or a number, seconds between the two frames.
         yaw: (B,) radians, heading of the body.
         sigma: (B, 22) metres, standard deviations.
-        root_seen: (B,) 1 if both frames have world positions, 0 if only positions relative to the root.
+        root_observed: (B,) 1 if both frames have world positions, 0 if only positions relative to the root.
         ground: (B, 8) metres, world, height of the ground under each of `CONTACT_JOINTS`; NaN where unknown.
     """
     joints, joints_before = positions[:, _JOINTS], before[:, _JOINTS]
@@ -53,8 +53,8 @@ def contact_features(
     step = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(positions),))[:, None, None]
     back = yaw_matrix(yaw)  # p @ back turns p so that the body faces +x
     from_root, from_root_before = joints - positions[:, :1], joints_before - before[:, :1]
-    seen = root_seen[:, None, None] > 0
-    velocity = np.where(seen, (joints - joints_before) / step, np.nan)
+    observed = root_observed[:, None, None] > 0
+    velocity = np.where(observed, (joints - joints_before) / step, np.nan)
     height = joints[..., 2] - ground - REST_HEIGHT
     parts = [
         from_root @ back / FROM_ROOT,
@@ -65,7 +65,7 @@ def contact_features(
         np.ones((*known.shape, 1)),
     ]
     of_joints = np.nan_to_num(np.concatenate(parts, axis=-1), nan=0.0) * known[..., None]
-    of_body = np.stack([root_seen, np.isfinite(ground).any(axis=1).astype(float)], axis=1)
+    of_body = np.stack([root_observed, np.isfinite(ground).any(axis=1).astype(float)], axis=1)
     return np.concatenate([of_joints.reshape(len(positions), -1), of_body], axis=1).astype(np.float32)
 
 

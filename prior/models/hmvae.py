@@ -1,8 +1,8 @@
 """Live inference of HM-VAE: windows through the posterior's mean and the decoder.
 
 The results equal those of `HMVAE.reconstruct`, at a fifth of the cost. For one body, reading weights from memory
-dominates, so linear operations are folded once. Pooling and unpooling are folded into the convolutions. Taps that see
-the same frames, because the window's ends are reflected, become one. All operations from a latent up to the next
+dominates, so linear operations are folded once. Pooling and unpooling are folded into the convolutions. Taps that read
+the same frame, because the window's ends are reflected, become one. All operations from a latent up to the next
 activation become one product, which reads the latent's six numbers per edge. Features are (B, T, E * C).
 """
 
@@ -45,9 +45,9 @@ class HMVAEConfig:
     global_latent: int = 6
     """dimensions of z_g per edge (official: 6; 24)"""
     about_mean: bool = False
-    """whether each joint's rotations are encoded and decoded in the frame of their observed mean over the window. The
-    paper encodes the rotations themselves, and its error is mostly constant over the window. With the mean given,
-    only the motion within the window has to be encoded. The encoder also sees the mean pose"""
+    """whether each joint's rotations are encoded and decoded in the frame of their observed mean over the window, which
+    is also an input of the encoder. The paper encodes the rotations themselves, and its error is mostly constant over
+    the window. Given the mean, only the motion within the window has to be encoded"""
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HMVAEConfig:
@@ -123,12 +123,12 @@ class LiveHMVAE:
     def __call__(self, x: Floats32) -> Floats32:
         """Decode the posterior's mean of windows (B, T, 22, 6): equations 10 and 11."""
         first, *others = self._encoder
-        seen, mean = x, None
+        inputs, mean = x, None
         if self._about_mean:
             mean = _mean_pose(x)
             deviation = (_columns(x, mean) - _NO_ROTATION) / np.float32(DEVIATION)
-            seen = np.concatenate([deviation, np.broadcast_to(_first_two(mean), x.shape)], axis=-1)
-        features = leaky_relu(first(seen.reshape(*x.shape[:2], -1)))
+            inputs = np.concatenate([deviation, np.broadcast_to(_first_two(mean), x.shape)], axis=-1)
+        features = leaky_relu(first(inputs.reshape(*x.shape[:2], -1)))
         local = self._from_local(self._local(features))
         for layer in others:
             features = leaky_relu(layer(features))

@@ -1,21 +1,21 @@
 """Posture prior: the positions of joints given each other, as a Gaussian of the whole body in the trunk's frame.
 
-The joints of the trunk are almost rigid relative to each other, and limbs have typical postures. The whole body
-therefore informs a noisy joint. For x ~ N(mean, S), observed as z = x + e with e ~ N(0, R), the expectation is z - R (S
-+ R)^-1 (z - mean) and the covariance is R - R (S + R)^-1 R. This is ridge regression with the noise as the ridge
-(Bishop 2006, section 2.3.3). R is diagonal and holds each joint's variance, so a noise-free joint does not move, and a
-hidden joint follows the others. After that, the person's bone lengths are imposed.
+The joints of the trunk are almost rigid relative to each other, and limbs have typical postures. The position of a
+noisy joint is therefore estimated from the whole body. For x ~ N(mean, S), observed as z = x + e with e ~ N(0, R), the
+expectation is z - R (S + R)^-1 (z - mean) and the covariance is R - R (S + R)^-1 R. This is ridge regression with the
+noise as the ridge (Bishop 2006, section 2.3.3). R is diagonal and holds each joint's variance, so a noise-free joint
+does not move, and a hidden joint follows the others. The result is then conditioned on the person's bone lengths.
 
-The frame is spanned by the noisy hips and shoulders. S therefore includes a rotation and a translation of the frame, in
-which no posture is preferred. A body may lie, or stand on its hands.
+The frame is spanned by the noisy hips and shoulders. S therefore includes a rotation and a translation of the frame.
+The Gaussian does not depend on the body's orientation in the world, so a body may lie, or stand on its hands.
 
-The rotation of the pelvis in that frame is another vector of the Gaussian, so shoulders, spine and thighs inform it
-too. The root's rotation is a weighted average of this estimate and the estimate from the pelvis' own joints. If those
-joints are exact, they determine it; if they are noisy, the whole body does.
+The rotation of the pelvis in that frame is another vector of the Gaussian, so it is also estimated from shoulders,
+spine and thighs. The root's rotation is a weighted average of this estimate and the estimate from the pelvis' own
+joints. If those joints are exact, they determine it; if they are noisy, the whole body does.
 
-The pelvis is a rigid part that carries both hips and the lowest spine joint. The line to the chest is three times as
-long and less noisy, but bends with the spine. The pelvis of motion files differs by 0.9 degrees (median) from the rigid
-part, and by 3.4 degrees from the frame of hips and chest (validation people).
+The pelvis is a rigid part with both hips and the lowest spine joint. The line to the chest is three times as long and
+less noisy, but bends with the spine. The orientation of the pelvis in motion files differs by 0.9 degrees (median) from
+that of the rigid part, and by 3.4 degrees from the frame of hips and chest (validation people).
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ class LivePosture:
         """
         known = np.isfinite(positions[0, :, 0]) & np.isfinite(positions[0, MIRROR, 0])
         bones = np.linalg.norm(positions[0] - positions[0, PARENT], axis=-1)
-        seen = known & known[PARENT] & (REST_LENGTHS > 0.0)
-        size = max(float(np.median(bones[seen] / REST_LENGTHS[seen])), MIN_SIZE) if seen.any() else 1.0
+        both = known & known[PARENT] & (REST_LENGTHS > 0.0)
+        size = max(float(np.median(bones[both] / REST_LENGTHS[both])), MIN_SIZE) if both.any() else 1.0
         middle = positions[:, list(_CORNERS)].mean(axis=1)
         local = (positions - middle[:, None]) @ trunk_frame(positions) / size
         off = local[:, known].reshape(len(local), -1) - self.mean.reshape(22, 3)[known].ravel()
@@ -305,8 +305,8 @@ def body_size(offsets: Floats) -> Floats:
 
 def rigid_pelvis(positions: Floats, offsets: Floats) -> Floats:
     """(B, 3, 3) least squares rotation from the pelvis' bones (B, 22, 3) to its joints (B, 22, 3) (Kabsch)."""
-    seen = positions[:, list(_CARRIED)] - positions[:, :1]
-    u, _, vt = np.linalg.svd(seen.swapaxes(-1, -2) @ offsets[:, list(_CARRIED)])
+    observed = positions[:, list(_CARRIED)] - positions[:, :1]
+    u, _, vt = np.linalg.svd(observed.swapaxes(-1, -2) @ offsets[:, list(_CARRIED)])
     u[..., -1] *= np.linalg.det(u @ vt)[:, None]
     return u @ vt
 

@@ -1,6 +1,6 @@
 """Live prediction of a body's root velocity from its own motion (HM-VAE, section 3.3), without torch.
 
-A recurrent network replaces the paper's convolutions over the skeleton, which see 25 frames; it is smaller and faster.
+A recurrent network replaces the paper's convolutions over the skeleton and 25 frames; it is smaller and faster.
 """
 
 from __future__ import annotations

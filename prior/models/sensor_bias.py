@@ -15,8 +15,7 @@ SMOOTHER_DENSITY = 1.0
 """Spectral density of the acceleration noise of the causal smoother before the network, m²/s³. The smoother keeps the
 input's jitter out of the network's output."""
 
-HISTORY: tuple[int, ...] = (0, 1, 2, 4, 7, 12)
-"""Ages of the network's input frames at 30 Hz, frames; it sees no future frames."""
+HISTORY: tuple[int, ...] = (0, 1, 2, 4, 7, 12)  # ages of the network's input frames, frames at 30 Hz
 
 _CORNERS = (*HIPS, *SHOULDERS)
 VECTORS = 22 * len(HISTORY) + 2
@@ -68,8 +67,8 @@ def features(history: Floats, camera: Floats) -> Floats:
     joints = np.moveaxis(history - hips[:, None], 0, 1).reshape(len(hips), -1, 3)
     vectors = np.concatenate([joints, up[:, None], (view / np.maximum(distance, 1e-9))[:, None]], axis=1)
     turned = vectors @ to_trunk.swapaxes(-1, -2)
-    seen = finite_joints(newest).astype(np.float64)
-    return np.concatenate([turned.reshape(len(hips), -1), distance, -view[:, 2:], seen], axis=1)
+    observed = finite_joints(newest).astype(np.float64)
+    return np.concatenate([turned.reshape(len(hips), -1), distance, -view[:, 2:], observed], axis=1)
 
 
 def recall(frames: Floats) -> Floats:
@@ -77,8 +76,8 @@ def recall(frames: Floats) -> Floats:
 
     Frames before a body's first one repeat its first.
     """
-    seen = np.isfinite(frames[..., 0]).any(axis=-1)
-    first = np.where(seen.any(axis=0), seen.argmax(axis=0), len(frames) - 1)
+    observed = np.isfinite(frames[..., 0]).any(axis=-1)
+    first = np.where(observed.any(axis=0), observed.argmax(axis=0), len(frames) - 1)
     rows = np.maximum(len(frames) - 1 - np.array(HISTORY)[:, None], first)
     return frames[rows, np.arange(frames.shape[1])]
 
@@ -93,7 +92,7 @@ class LiveCorrection:
         for k in (0, 3, 6):  # activation and dropout lie between
             layer = part(weights, f"layers.{k}")
             matrix = p.linear(matrix, layer["weight"].T, layer["bias"], active=k > 0)
-        self._answer, self._net = matrix, Network(p, max_batch)
+        self._output, self._net = matrix, Network(p, max_batch)
 
     @classmethod
     def load(cls, sensor: str, max_batch: int) -> LiveCorrection:
@@ -108,4 +107,4 @@ class LiveCorrection:
         rows = slice(0, len(features))
         self._net.matrix(self._features, rows)[:, 0] = np.nan_to_num((features - self._mean) / self._scale)
         self._net.run(rows)
-        return self._net.matrix(self._answer, rows).reshape(-1, 22, 3).astype(np.float64)
+        return self._net.matrix(self._output, rows).reshape(-1, 22, 3).astype(np.float64)

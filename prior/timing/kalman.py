@@ -32,8 +32,8 @@ class ConstantVelocityFilter:
 
     The process is white-noise acceleration (Bar-Shalom, Li and Kirubarajan 2001, equation 6.2.2-12). The measurement is
     a position with an isotropic error. The three coordinates of a joint therefore share one 2x2 covariance. A joint
-    starts at its first measurement, with a velocity of 0 +- `INITIAL_SPEED`. A missing joint coasts, and its standard
-    deviation grows.
+    starts at its first measurement, with a velocity of 0 ± `INITIAL_SPEED`. A missing joint is extrapolated, and its
+    standard deviation increases.
 
     Args:
         acceleration_density: m²/s³, power spectral density of the acceleration.

@@ -29,8 +29,8 @@ RARE = 2  # number of the longest counts that are ignored, because a simulated p
 PERIODS = 7  # number of frame intervals whose median is a stream's period
 REGULAR = (0.5, 1.5)  # range of the intervals between the frames used, as multiples of the median
 ROUNDED, KEPT = 0.1, 0.55
-"""Constants of the factor ``m``: it is the ratio of the rates minus the first, rounded, and is kept while it is off by
-less than the second."""
+"""Constants of the factor ``m``. It is the ratio of the rates minus the first constant, rounded, and changes only if it
+differs from this by at least the second (hysteresis)."""
 MAX_FACTOR = 8  # largest factor ``m``; in faster streams, only the nearest frames are used
 MEMORY_S = 0.5  # time constant of the running means of squared residuals, seconds
 MIN_FRAMES = 6  # number of frames of a joint before its noise is known
@@ -77,13 +77,13 @@ class Resampler:
         self._period_ns = float(PERIOD_NS)
         self._gap_ns = 0
         self._is_slow = False  # whether the last two frames came after longer gaps than are interpolated
-        self._seen_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
+        self._observed_ns = np.full((2, self._slots, 22), np.iinfo(np.int64).min // 2)
         self._positions = np.full((2, self._slots, 22, 3), np.nan)
         self._confidence = np.zeros((2, self._slots, 22))
 
     def clear(self, slot: Bools) -> None:
         """Forget the observations of these slots (S,)."""
-        self._seen_ns[:, slot] = np.iinfo(np.int64).min // 2
+        self._observed_ns[:, slot] = np.iinfo(np.int64).min // 2
         self._decimation.clear(slot)
 
     def update(self, stamp_ns: int, positions: Floats, confidence: Floats) -> list[Frame]:
@@ -110,15 +110,15 @@ class Resampler:
             self._period_ns += PERIOD_GAIN * (min(stamp_ns - self._newest_ns, PERIOD_NS) - self._period_ns)
         self._newest_ns = stamp_ns
         look_ahead_ns = min(LOOK_AHEAD_NS, round(LOOK_AHEAD_PERIODS * self._period_ns))
-        seen = np.isfinite(positions[..., 0])
+        observed = np.isfinite(positions[..., 0])
         # row 1 is each joint's last observation, row 0 the one before
         for store, value in (
-            (self._seen_ns, np.full(seen.shape, stamp_ns)),
+            (self._observed_ns, np.full(observed.shape, stamp_ns)),
             (self._positions, positions),
             (self._confidence, confidence),
         ):
-            store[0][seen] = store[1][seen]
-            store[1][seen] = value[seen]
+            store[0][observed] = store[1][observed]
+            store[1][observed] = value[observed]
         frames = []
         while self._tick_ns is not None and self._tick_ns <= stamp_ns + look_ahead_ns:
             frames.append(Frame(self._tick_ns, *self._at(self._tick_ns, stamp_ns)))
@@ -126,7 +126,7 @@ class Resampler:
         return frames
 
     def _at(self, tick: int, now: int) -> tuple[Floats, Floats]:
-        before, after = self._seen_ns
+        before, after = self._observed_ns
         span = after - before
         between = (span <= MAX_GAP_NS) & (before - LOOK_AHEAD_NS <= tick) & (tick <= after + LOOK_AHEAD_NS)
         # each frame of a slow stream counts at one grid time, although it may be off by most of a period

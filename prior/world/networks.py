@@ -140,7 +140,7 @@ class ContactNetwork:
         features = contact_features(
             np.array([now.positions for now in observed]), np.array([last.positions for last in before]),
             np.array(dt), np.array([now.yaw for now in observed]), np.array([now.sigma for now in observed]),
-            root_seen=np.array(roots, dtype=float),
+            root_observed=np.array(roots, dtype=float),
             ground=np.array([_under(now, floor, known) for now, known in zip(observed, roots, strict=True)]),
         )  # fmt: skip
         return [Contacts(*rows) for rows in zip(*self._net(features, np.array(states)), strict=True)]

@@ -124,7 +124,7 @@ class MixtureNet(nn.Module):
         return _faded(kept, (1.0 - kept) * written)
 
 
-def answer(
+def estimate(
     outputs: Tensor, experts: Tensor, heading: Tensor, scale: Tensor, gap: Tensor, between: Tensor, fallback: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return positions (..., 22, 3) metres, and their variances along an axis (..., 22) mm².

@@ -143,7 +143,7 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
     alone = rng.random(count) < FEET_ALONE
     positions[np.ix_(alone, np.arange(frames), _HANDS_KNEES_ROOT)] = np.nan
     positions[..., 2] += rng.normal(0.0, SOLE_SD, (count, 1, 1)) + rng.normal(0.0, SOLE_SD / 2, (count, 1, 22))
-    root_seen = (alone | (rng.random(count) >= ROOT_UNSEEN)).astype(float)
+    root_observed = (alone | (rng.random(count) >= ROOT_UNSEEN)).astype(float)
     known = rng.random(count) >= GROUND_UNKNOWN
     ground = np.where(known[:, None], np.zeros((count, len(CONTACT_JOINTS))), np.nan)
     yaw = pool.yaw[clips] + np.where(alone, rng.uniform(-np.pi, np.pi, count), rng.normal(0.0, YAW_SD, count))[:, None]
@@ -156,7 +156,7 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
 
     features = contact_features(
         rows(positions[:, 1:]), rows(positions[:, :-1]), 1.0 / FPS, rows(yaw[:, 1:]), rows(pool.sigma[clips][:, 1:]),
-        of_frames(root_seen), of_frames(ground),
+        of_frames(root_observed), of_frames(ground),
     )  # fmt: skip
     estimated = np.isfinite(pool.sigma[clips][:, 1:, :1])
     load, rest, counts = pool.load[clips][:, 1:], pool.rest[clips][:, 1:], estimated

@@ -26,7 +26,7 @@ from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.recordings import write_arrays
 from steadypose.training.data.sensors import Sensed, Sensors
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
-from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
+from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, estimate
 
 ITERATIONS, RATE = 6000, 2e-3  # number of optimiser steps, and the initial learning rate
 FRAMES = 90  # length of a clip, frames; it starts like a stream
@@ -133,7 +133,7 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> tuple[Tensor, Tens
     outputs = network(batch.features, (batch.gap >= 0).any(dim=-1))
     known = batch.truth.isfinite().all(dim=-1) & batch.experts.isfinite().all(dim=(-1, -2))
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
-    places, variance = answer(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
+    places, variance = estimate(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
     weight = known / (1.0 + batch.gap.clamp(min=0))  # nothing can be learned far from any observation
     seen = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)

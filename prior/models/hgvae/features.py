@@ -1,10 +1,10 @@
-"""HG-VAE's input: windows of joints as tracks about a smooth path of the trunk, facing forward, of standard size.
+"""HG-VAE's input: windows of root-relative joints (*tracks*) of a body of standard size that faces forward.
 
-The path is a low-passed mean of the observed joints of the trunk, so that it neither jitters with one noisy joint nor
-jumps when a joint disappears. All joints except the pelvis are relative to the path. The pelvis's track is relative to
-the path's mean, so it contains the locomotion. Unobserved entries are interpolated: in a gap, a joint's offset from its
-parent is interpolated linearly; before the first and after the last observation, it is held. Completion starts from
-this.
+The root is a smooth trajectory, the *path*: a low-passed mean of the trunk's observed joints, which neither jitters
+with one noisy joint nor jumps when a joint disappears. The track of every joint except the pelvis is its position
+relative to the path. The pelvis's track is relative to the path's mean, so it contains the locomotion. Unobserved
+entries are interpolated, as a start for the completion network: in a gap, a joint's offset from its parent is
+interpolated linearly; before the first and after the last observation, the offset is held.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right
                                  "neck")])  # fmt: skip
 _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
 _PATH_COEFFICIENTS = 8
-"""Number of cosine coefficients of the trunk's path that are kept: a low pass at 2 Hz for a window of 50 frames."""
+"""Number of cosine coefficients of the path that are kept: a low pass at 2 Hz for a window of 50 frames."""
 
 
 class Tracks(NamedTuple):
@@ -83,8 +83,8 @@ def from_tracks(x: NDArray[np.float64], tracks: Tracks, size: NDArray[np.floatin
 
 
 def hang_unseen(deviations: NDArray[np.floating]) -> None:
-    """Fill in joints that were never observed (NaN) in ``deviations`` (..., 66, T) from the mean tracks, in place: each
-    gets its parent's deviation."""
+    """Give each joint that was never observed (NaN) its parent's deviation, in place. ``deviations`` (..., 66, T) are
+    differences from the mean tracks."""
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
 

@@ -27,7 +27,7 @@ LAG = 5  # interval over which the mobility of a joint relative to its parent is
 
 GROWTH = 1.5
 """Exponent of the growth of the interpolation's variance with the time from an observation: 1 is a random walk, 2
-constant velocity. A learned exponent is dominated by faults of the training sensors, and moves arms that rest."""
+constant velocity. A learned exponent is dominated by faults of the training sensors, and moves resting arms."""
 
 STILL = 0.004  # least mobility of a joint along an axis in `LAG` frames, metres
 CENTIMETRE = 0.01 / SCALE  # unit of the joints' noise, which enters by its logarithm: a centimetre in units of `SCALE`

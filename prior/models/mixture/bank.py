@@ -79,7 +79,7 @@ class Bank(NamedTuple):
     observations: Floats  # (S, J) number of observations in these sums, with forgetting
     # of joints
     raw: Floats  # (S, J, K, 3) metres, the raw position, or the last one while unobserved; NaN before the first
-    unseen: Floats  # (S, J, K) frames since the joint was last observed; -1 before the first observation
+    since: Floats  # (S, J, K) frames since the joint was last observed; -1 before the first observation
     confidence: Floats  # (S, J, K) confidence of the observation
     recent: Floats  # (S, J, 7, 3) metres, raw positions of the last frames; NaN where unobserved
     distances: Floats  # (S, J, M, 2) metres², running means of the squared distances between neighbouring experts
@@ -110,7 +110,7 @@ def new_bank(bodies: int, delay: int) -> Bank:
         log_variances=np.empty((bodies, joints, experts)),
         observations=np.empty((bodies, joints)),
         raw=np.empty((bodies, joints, frames, 3)),
-        unseen=np.empty((bodies, joints, frames)),
+        since=np.empty((bodies, joints, frames)),
         confidence=np.empty((bodies, joints, frames)),
         recent=np.empty((bodies, joints, _HISTORY, 3)),
         distances=np.empty((bodies, joints, experts, 2)),
@@ -136,7 +136,7 @@ def forget(bank: Bank, slot: Bools) -> None:
     for values in (bank.raw, bank.recent, bank.place):
         values[slot] = np.nan
     bank.modes[slot], bank.eigenvalue[slot] = np.eye(bank.modes.shape[1]), 1.0
-    bank.unseen[slot] = -1.0
+    bank.since[slot] = -1.0
     bank.heading[slot] = (1.0, 0.0)
 
 
@@ -156,31 +156,31 @@ def advance(bank, count, step, positions, confidence, densities, sigma, covarian
     """
     bodies, joints, _, frames, _ = bank.position.shape
     slot, last = count % frames, (count - 1) % frames
-    seen, known = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
+    observed, known = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
     members = np.empty(joints, dtype=np.bool_)
     for s in range(bodies):
         for j in range(joints):
             members[j] = bank.member[s, j] > 0.0
         for j in range(joints):
-            seen[j] = np.isfinite(positions[s, j, 0] + positions[s, j, 1] + positions[s, j, 2])
-            known[j] = bank.unseen[s, j, last] >= 0
-            bank.confidence[s, j, slot] = confidence[s, j] if seen[j] else 0.0
-            bank.unseen[s, j, slot] = 0.0 if seen[j] else bank.unseen[s, j, last] + 1.0 if known[j] else -1.0
+            observed[j] = np.isfinite(positions[s, j, 0] + positions[s, j, 1] + positions[s, j, 2])
+            known[j] = bank.since[s, j, last] >= 0
+            bank.confidence[s, j, slot] = confidence[s, j] if observed[j] else 0.0
+            bank.since[s, j, slot] = 0.0 if observed[j] else bank.since[s, j, last] + 1.0 if known[j] else -1.0
             for axis in range(3):
                 for k in range(_HISTORY - 1):
                     bank.recent[s, j, k, axis] = bank.recent[s, j, k + 1, axis]
-                came = positions[s, j, axis] if seen[j] else np.nan
+                came = positions[s, j, axis] if observed[j] else np.nan
                 bank.recent[s, j, _HISTORY - 1, axis] = came
-                bank.raw[s, j, slot, axis] = bank.raw[s, j, last, axis] if known[j] and not seen[j] else came
-            if seen[j]:
+                bank.raw[s, j, slot, axis] = bank.raw[s, j, last, axis] if known[j] and not observed[j] else came
+            if observed[j]:
                 _measure_differences(bank.recent[s, j], bank.sizes[s, j], bank.age[s, j])
-        if seen.any():
+        if observed.any():
             for j in range(joints):
-                bank.streak[s, j] = bank.streak[s, j] + 1.0 if seen[j] else 0.0
-                held, settled = bank.unseen[s, j, slot] <= HELD, bank.streak[s, j] > SETTLED
+                bank.streak[s, j] = bank.streak[s, j] + 1.0 if observed[j] else 0.0
+                held, settled = bank.since[s, j, slot] <= HELD, bank.streak[s, j] > SETTLED
                 members[j] = known[j] and (held if bank.member[s, j] > 0.0 else settled)
             _change_body(bank, s, members, covariance)
-        _track(bank, s, slot, last, step, positions[s], confidence[s], seen, known, members, densities, sigma)
+        _track(bank, s, slot, last, step, positions[s], confidence[s], observed, known, members, densities, sigma)
 
 
 @njit(cache=True)
@@ -206,12 +206,12 @@ def _change_body(bank, s, members, covariance):
 
 
 @njit(cache=True)
-def _track(bank, s, slot, last, step, positions, confidence, seen, known, members, densities, sigma):
+def _track(bank, s, slot, last, step, positions, confidence, observed, known, members, densities, sigma):
     """Predict and update all filters of a body. The track of a single joint has that joint's index."""
-    joints, modes = len(seen), bank.modes[s]
+    joints, modes = len(observed), bank.modes[s]
     weight, variance, updated = np.empty(joints), np.empty(joints), np.empty(joints, dtype=np.bool_)
     measured, filled = np.zeros((joints, 3)), np.empty((joints, 3))
-    best = weigh(confidence, seen, members, weight)
+    best = weigh(confidence, observed, members, weight)
     for t in range(joints):
         share = 0.0
         for j in range(joints):

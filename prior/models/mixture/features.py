@@ -81,7 +81,7 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
         count: number of frames processed, including the newest.
         back: frames between the newest and this one.
         parents: (J,) parent of each joint; 0 for the root.
-        whiteness: (S,) share of the noise that is known to be white, and so equal in all tracks; see `SHARED`.
+        whiteness: (S,) share of the noise that is white, and therefore equal in all tracks; see `SHARED`.
         experts: (S, J, EXPERTS, 3) metres, written; NaN for a joint that has not been observed yet.
         features: (S, J, FEATURES) float32, written.
         scale: (S,) metres along an axis, estimated noise of the body's joints, written.
@@ -94,17 +94,17 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
     slot = (count - 1 - back) % frames
     weights, noise = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     for s in range(bodies):
-        total, seen_joints = 0.0, 0.0
+        total, observed_joints = 0.0, 0.0
         write_experts(
             bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
-            bank.observations[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness[s], experts[s],
+            bank.observations[s], bank.raw[s, :, slot], bank.since[s, :, slot], SHARED * whiteness[s], experts[s],
             weights, noise,
         )  # fmt: skip
         for j in range(joints):
-            gap[s, j], between[s, j] = bank.unseen[s, j, slot], 0.0
+            gap[s, j], between[s, j] = bank.since[s, j, slot], 0.0
             if gap[s, j] > 0.0:
                 for since in range(1, back + 1):
-                    if bank.unseen[s, j, (slot + since) % frames] == 0.0:
+                    if bank.since[s, j, (slot + since) % frames] == 0.0:
                         gap[s, j] = min(gap[s, j], since)
                         scales = bank.squared_innovations[s, j] / max(bank.observations[s, j], 1.0)
                         between[s, j] = _deviation(experts[s, j], weights[j], bank.variance[s, j, :, slot], scales)
@@ -121,16 +121,16 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
                 bank.noise[s, j] += (square - bank.noise[s, j]) / min(bank.age[s, j, 0], MEAN_FRAMES)
             if bank.age[s, j, 0] > 0.0:
                 total += bank.noise[s, j]
-                seen_joints += 1.0
-        scale[s] = np.sqrt(total / max(seen_joints, 1.0) / 3.0) + LOG_FLOOR
+                observed_joints += 1.0
+        scale[s] = np.sqrt(total / max(observed_joints, 1.0) / 3.0) + LOG_FLOOR
         if not (gap[s] == 0.0).any():
             between[s] = 0.0
         _update_heading(experts[s], bank.heading[s])
-        unseen = bank.unseen[s, :, slot]
+        unobserved = bank.since[s, :, slot]
         for j in range(joints):
             confidence, age = bank.confidence[s, j, slot], bank.age[s, j]
-            _describe_observation(unseen[j], gap[s, j], confidence, age[0], back, scale[s], features[s, j])
-            if unseen[j] >= 0.0:
+            _describe_observation(unobserved[j], gap[s, j], confidence, age[0], back, scale[s], features[s, j])
+            if unobserved[j] >= 0.0:
                 heading = bank.heading[s]
                 _describe_experts(experts[s, j], bank.distances[s, j], heading, scale[s], features[s, j])
                 _describe_multiple_model(experts[s, j], weights[j], noise[j], heading, scale[s], features[s, j])
@@ -138,8 +138,8 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
                     for k in range(len(LAGS)):
                         features[s, j, _SIZES + k] = bank.sizes[s, j, k] + _CENTIMETRES
                 length = bank.length[s, j]
-                _describe_bone(j, parents[j], unseen, length, age, experts[s], heading, scale[s], features[s, j])
-                _describe_pose(j, unseen[0], experts[s], bank.place[s, j], heading, features[s, j])
+                _describe_bone(j, parents[j], unobserved, length, age, experts[s], heading, scale[s], features[s, j])
+                _describe_pose(j, unobserved[0], experts[s], bank.place[s, j], heading, features[s, j])
         for j in range(joints):
             for axis in range(3):
                 bank.place[s, j, axis] = experts[s, j, POSE_EXPERT, axis]
@@ -147,24 +147,24 @@ def describe(bank, count, back, parents, whiteness, experts, features, scale, ga
 
 @njit(cache=True)
 def write_experts(
-    tracks, modes, squared_innovations, log_variances, observations, raw, unseen, shared, experts, weights, noise
+    tracks, modes, squared_innovations, log_variances, observations, raw, unobserved, shared, experts, weights, noise
 ):
     """Write the joints' experts (J, EXPERTS, 3), and the tracks' smoother weights (J, M) and noise (J,).
 
     ``shared`` is the weight, in observations, of the noise of all tracks in that of each.
     """
     joints = len(tracks)
-    own, found = np.empty((joints, _SMOOTHERS)), np.empty(joints)
+    own, noises = np.empty((joints, _SMOOTHERS)), np.empty(joints)
     mean, logarithm, tracked = np.zeros((joints, 3)), 0.0, 0
     for t in range(joints):
-        found[t] = multiple_model_weights(squared_innovations[t], log_variances[t], observations[t], 0.0, 0.0, own[t])
+        noises[t] = multiple_model_weights(squared_innovations[t], log_variances[t], observations[t], 0.0, 0.0, own[t])
         if observations[t] > 0.0:
-            logarithm += np.log(found[t])
+            logarithm += np.log(noises[t])
             tracked += 1
     for t in range(joints):
         if shared > 0.0 and tracked > 0:
             expected = np.exp(logarithm / tracked)
-            found[t] = multiple_model_weights(
+            noises[t] = multiple_model_weights(
                 squared_innovations[t], log_variances[t], observations[t], expected, shared, own[t]
             )
         for m in range(_SMOOTHERS):
@@ -176,14 +176,14 @@ def write_experts(
             weights[j, m] = 0.0
         for m in range(EXPERTS):
             for axis in range(3):
-                experts[j, m, axis] = 0.0 if unseen[j] >= 0.0 else np.nan
+                experts[j, m, axis] = 0.0 if unobserved[j] >= 0.0 else np.nan
         for axis in range(3):
             experts[j, RAW, axis] = raw[j, axis]
         for t in range(joints):
             share = modes[j, t]
             if share == 0.0:
                 continue
-            noise[j] += share * share * found[t]
+            noise[j] += share * share * noises[t]
             for m in range(_SMOOTHERS):
                 weights[j, m] += share * share * own[t, m]
                 for axis in range(3):
@@ -245,17 +245,17 @@ def _write_vector(heading, x, y, z, unit, features, at):
 
 
 @njit(cache=True)
-def _describe_observation(unseen, gap, confidence, age, back, scale, features):
+def _describe_observation(unobserved, gap, confidence, age, back, scale, features):
     """Observation and delay; sets all other features to 0."""
     for k in range(FEATURES):
         features[k] = 0.0
     for k, delay in enumerate(_DELAYS):
         features[_DELAY + k] = 1.0 / (1.0 + (back - delay) ** 2)
     features[_DELAY + len(_DELAYS)] = back / 16.0
-    if unseen < 0.0:
+    if unobserved < 0.0:
         return
-    features[_OBSERVED] = 1.0 if unseen == 0.0 else 0.0
-    features[_OBSERVED + 1] = np.log(1.0 + unseen)
+    features[_OBSERVED] = 1.0 if unobserved == 0.0 else 0.0
+    features[_OBSERVED + 1] = np.log(1.0 + unobserved)
     features[_OBSERVED + 2] = confidence
     features[_OBSERVED + 3] = 1.0 / (1.0 + age / 10.0)
     features[_OBSERVED + 4] = np.log(scale / 0.01)
@@ -287,10 +287,10 @@ def _describe_multiple_model(own, weights, noise, heading, scale, features):
 
 
 @njit(cache=True)
-def _describe_pose(j, unseen_root, experts, place, heading, features):
+def _describe_pose(j, root_unobserved, experts, place, heading, features):
     """Position relative to the root, and displacement since the last frame."""
     x, y, z = experts[j, POSE_EXPERT, 0], experts[j, POSE_EXPERT, 1], experts[j, POSE_EXPERT, 2]
-    if unseen_root >= 0.0:
+    if root_unobserved >= 0.0:
         a, b, c = experts[0, POSE_EXPERT, 0], experts[0, POSE_EXPERT, 1], experts[0, POSE_EXPERT, 2]
         _write_vector(heading, x - a, y - b, z - c, 0.5, features, _POSE)
     if np.isfinite(place[0]):
@@ -298,16 +298,16 @@ def _describe_pose(j, unseen_root, experts, place, heading, features):
 
 
 @njit(cache=True)
-def _describe_bone(j, parent, unseen, length, age, experts, heading, scale, features):
+def _describe_bone(j, parent, unobserved, length, age, experts, heading, scale, features):
     """Bone to the joint's parent: variance of its length, and current deviation from the mean length."""
-    if parent == j or unseen[parent] < 0.0:
+    if parent == j or unobserved[parent] < 0.0:
         return
     came, middle = 0.0, 0.0
     for axis in range(3):
         came += (experts[j, RAW, axis] - experts[parent, RAW, axis]) ** 2
         middle += (experts[j, POSE_EXPERT, axis] - experts[parent, POSE_EXPERT, axis]) ** 2
     came, middle = np.sqrt(came), np.sqrt(middle)
-    if unseen[j] == 0.0 and unseen[parent] == 0.0:
+    if unobserved[j] == 0.0 and unobserved[parent] == 0.0:
         age[2] += 1.0
         length[0] += (came - length[0]) / min(age[2], BONE_MEAN_FRAMES)
         length[1] += ((came - length[0]) ** 2 - length[1]) / min(age[2], BONE_MEAN_FRAMES)

@@ -79,7 +79,7 @@ class MixtureSmoother:
         self._note(stamp_s)
         self.white, self.correlated = self._whiteness.share(positions), self._whiteness.correlated
         advance(self._bank, self._count - 1, step, positions, certainty, DENSITIES, MEASUREMENT_SIGMA, self._covariance)
-        return self._answer(self.delay) if self._count > self.delay else None
+        return self._output(self.delay) if self._count > self.delay else None
 
     def skip(self, stamp_s: float) -> float:
         """Process a frame without bodies after ``delay`` such frames; return the stamp of the first of these."""
@@ -94,7 +94,7 @@ class MixtureSmoother:
 
     def flush(self) -> list[Smoothed]:
         """Return the estimates that the delay still holds, oldest first, and forget everything."""
-        held = [self._answer(back) for back in reversed(range(min(self.delay, self._count)))]
+        held = [self._output(back) for back in reversed(range(min(self.delay, self._count)))]
         self.forget(np.ones(self._slots, dtype=bool))
         self._stamps, self._count = [], 0
         return held
@@ -106,7 +106,7 @@ class MixtureSmoother:
         for values in self._memory:
             values[slot] = 0.0
 
-    def _answer(self, back: int) -> Smoothed:
+    def _output(self, back: int) -> Smoothed:
         """Return the estimate of the frame ``back`` frames before the newest."""
         bank = self._bank
         described = self._experts, self._features, self._scale, self._gap, self._between
@@ -206,7 +206,7 @@ def _write_outputs(slots, features, net, memory):
         _rectify(own[b])
         _remember(own[b], net.own_decay, memory.own[slot], memory.own_weight[slot], own_before[b])
     body = np.empty((count, len(net.body_decay)), dtype=np.float32)
-    lasting, summand = np.empty_like(body), np.empty_like(body)
+    remembered, summand = np.empty_like(body), np.empty_like(body)
     multiply_packed(own.reshape(count, -1), net.gather, net.gather_bias, body)
     _rectify(body)
     started = np.empty(count, dtype=np.bool_)
@@ -214,8 +214,8 @@ def _write_outputs(slots, features, net, memory):
         slot, row = slots[b], slice(b, b + 1)
         at = slice(slot, slot + 1)
         started[b] = memory.body_weight[slot, 0] > zero
-        _remember(body[row], net.body_decay, memory.body[at], memory.body_weight[at], lasting[row])
-    for of, weight, bias in ((lasting, net.remember, net.remember_bias), (body, net.think, net.think_bias)):
+        _remember(body[row], net.body_decay, memory.body[at], memory.body_weight[at], remembered[row])
+    for of, weight, bias in ((remembered, net.remember, net.remember_bias), (body, net.think, net.think_bias)):
         multiply_packed(of, weight, bias, summand)
         _rectify(summand)
         _add(summand, body)
@@ -289,14 +289,14 @@ def _write_next(bank, s, count, back, whiteness, experts):
     slot, joints = (count - back) % bank.position.shape[3], len(experts)
     write_experts(
         bank.position[s, :, :, slot], bank.modes[s], bank.squared_innovations[s], bank.log_variances[s],
-        bank.observations[s], bank.raw[s, :, slot], bank.unseen[s, :, slot], SHARED * whiteness, experts,
+        bank.observations[s], bank.raw[s, :, slot], bank.since[s, :, slot], SHARED * whiteness, experts,
         np.empty((joints, len(DENSITIES))), np.empty(joints),
     )  # fmt: skip
 
 
 @njit(cache=True)
 def _mixed(outputs, experts, heading, scale, gap, between, fallback, places, sigma):
-    """Compute `training.networks.mixture.answer` for one body. Joints that were never observed are not written."""
+    """Compute `training.networks.mixture.estimate` for one body. Joints that were never observed are not written."""
     cos, sin = heading
     weights, reach = np.empty(EXPERTS), np.empty(EXPERTS)
     for j in range(len(outputs)):

@@ -53,18 +53,18 @@ def clipped(confidence):
 
 
 @njit(cache=True)
-def weigh(confidence, seen, members, weight):
+def weigh(confidence, observed, members, weight):
     """Write the weights (J,) of the joints' measurements, and return the largest confidence in the body.
 
     Weights are inverse to the variances of the measurements; the largest in a body is 1.
     """
     most = 0.0
     for j in range(len(weight)):
-        if members[j] and seen[j]:
+        if members[j] and observed[j]:
             most = max(most, clipped(confidence[j]))
     for j in range(len(weight)):
         own = clipped(confidence[j]) / most if members[j] else 1.0
-        weight[j] = own * own if seen[j] else 0.0
+        weight[j] = own * own if observed[j] else 0.0
     return most
 
 

@@ -25,10 +25,10 @@ def walk() -> tuple[np.ndarray, np.ndarray]:
     return motion.positions, np.arctan2(-left[:, 0], left[:, 1])
 
 
-def features(positions, yaw, sigma=0.001, root_seen=1.0, ground=0.0) -> np.ndarray:
+def features(positions, yaw, sigma=0.001, root_observed=1.0, ground=0.0) -> np.ndarray:
     count = len(positions) - 1
     return contact_features(
-        positions[1:], positions[:-1], DT, yaw[1:], np.full((count, 22), sigma), np.full(count, root_seen),
+        positions[1:], positions[:-1], DT, yaw[1:], np.full((count, 22), sigma), np.full(count, root_observed),
         np.full((count, 8), ground),
     )  # fmt: skip
 
@@ -36,7 +36,7 @@ def features(positions, yaw, sigma=0.001, root_seen=1.0, ground=0.0) -> np.ndarr
 def test_what_is_not_known_is_nought():
     positions, yaw = walk()
     known = features(positions, yaw).reshape(-1, FEATURES)
-    unplaced = features(positions, yaw, root_seen=0.0, ground=np.nan)
+    unplaced = features(positions, yaw, root_observed=0.0, ground=np.nan)
     assert (unplaced[:, -2:] == 0).all()
     each = unplaced[:, :-2].reshape(len(unplaced), 8, OF_JOINT)
     assert (each[..., 6:10] == 0).all()
@@ -77,13 +77,13 @@ def test_frame_by_frame_it_says_the_same():
         np.testing.assert_allclose(said.rest, torch.sigmoid(rest[:, t]), atol=1e-5)
 
 
-@pytest.mark.parametrize(("root_seen", "ground", "least"), [(1.0, 0.0, 0.9), (0.0, np.nan, 0.8)])
-def test_the_shipped_weights_know_a_walk(root_seen: float, ground: float, least: float):
+@pytest.mark.parametrize(("root_observed", "ground", "least"), [(1.0, 0.0, 0.9), (0.0, np.nan, 0.8)])
+def test_the_shipped_weights_know_a_walk(root_observed: float, ground: float, least: float):
     """Bounds a little under what was measured; without root and ground, from the body's own motion alone."""
     positions, yaw = walk()
     live = LiveContacts.load("default")
     state, said = np.zeros((1, live.hidden), dtype=np.float32), []
-    for row in features(positions, yaw, root_seen=root_seen, ground=ground):
+    for row in features(positions, yaw, root_observed=root_observed, ground=ground):
         answer = live(row[None], state)
         state = answer.state
         said.append(answer.load[0, FEET] > 0.5)

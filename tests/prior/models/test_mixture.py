@@ -16,7 +16,7 @@ from steadypose.prior.models.mixture.tracks import HELD, MEMORY, MIN_SCALE, SETT
 from steadypose.prior.timing.kalman import ConstantVelocityFilter, Smoothed
 from steadypose.prior.timing.rate import FPS
 from steadypose.training.data.sensors import Sensed
-from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, answer
+from steadypose.training.networks.mixture import MixtureConfig, MixtureNet, estimate
 from steadypose.training.recipes.mixture import through_bank
 
 DELAYS = (0, 1, 4, 16)
@@ -158,7 +158,7 @@ def test_live_form_gives_what_torch_gives(tmp_path: Path) -> None:
         with torch.no_grad():
             outputs = net(batch.features, torch.ones(batch.features.shape[:2], dtype=torch.bool))
             described = batch.experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback
-            expected, variance = answer(outputs, *described)
+            expected, variance = estimate(outputs, *described)
         found = smoothed(seen, delay, str(path))[: 50 - delay]
         origin = truth[0, :, 0][:, None, None]
         np.testing.assert_allclose(places(found).swapaxes(0, 1), expected.numpy() + origin, atol=2e-5)
