@@ -5,7 +5,7 @@ still, and the leg joints that bones connect to them. While the root is unobserv
 A body with both feet at rest is published as standing, with the root velocity of a swaying body.
 
 Legs that are only guesses (`LegMemory`) have no contacts. Their feet may still be placed as if they stood, because a
-guess on the floor is better than one above it, but that makes them no more certain.
+guess on the floor is better than one above it, but their standard deviations stay.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ SWAYS = 0.5  # prior probability that a body with both feet at rest only sways
 VELOCITY_ERROR = 0.3
 """Error-to-sigma ratio of the filter's velocity for a standing body with an observed root (validation)."""
 
-VELOCITY_STATED = 0.6
-"""Ratio of the published to the filter's standard deviation of the velocity while the pelvis is observed. It is the
-error-to-sigma ratio in motion on validation, for noise of 0 to 4 cm (benchmarks/NOTEBOOK.md)."""
+VELOCITY_SCALE = 0.6
+"""Factor on the filter's standard deviation of the velocity while the pelvis is observed: the error-to-sigma ratio in
+motion on validation, for noise of 0 to 4 cm (benchmarks/NOTEBOOK.md)."""
 
 
 def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
@@ -158,8 +158,8 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
     both_rest = float(rest.reshape(2, 2).max(axis=0).min()) if observed.root_observed else 0.0
     contacts = estimate.contacts.load.copy()
     contacts[LEG_CONTACTS][estimate.guessed] = np.nan
-    stated = VELOCITY_STATED if observed.pelvis_observed else 1.0
-    velocity, covariance = standing_velocity(root.velocity, root.covariance, both_rest, stated=stated)
+    scale = VELOCITY_SCALE if observed.pelvis_observed else 1.0
+    velocity, covariance = standing_velocity(root.velocity, root.covariance, both_rest, scale=scale)
     return WorldBody(
         id=observed.body.id,
         root_position=root.position,
@@ -175,9 +175,7 @@ def compose(estimate: BodyEstimate, lost_sigma: float) -> WorldBody:
     )
 
 
-def standing_velocity(
-    velocity: Floats, covariance: Floats, both_rest: float, *, stated: float
-) -> tuple[Floats, Floats]:
+def standing_velocity(velocity: Floats, covariance: Floats, both_rest: float, *, scale: float) -> tuple[Floats, Floats]:
     """Return velocity (3,) m/s and covariance (6, 6) of [position, velocity] of a root that may only sway.
 
     They are mean and covariance of a mixture of two cases: the root sways, or it moves as estimated.
@@ -186,7 +184,7 @@ def standing_velocity(
         velocity: (3,) m/s, the filter's estimate.
         covariance: (6, 6) of [position, velocity], the filter's: m², m²/s, m²/s².
         both_rest: probability that both feet rest.
-        stated: ratio of the published standard deviation of ``velocity`` to the filter's.
+        scale: factor on the filter's standard deviation of ``velocity``.
     """
     variance = float(np.trace(covariance[3:, 3:])) / 3.0
     error = VELOCITY_ERROR**2 * variance
@@ -194,9 +192,9 @@ def standing_velocity(
     log_odds = 1.5 * math.log(moves / sway) - 0.5 * squared * (1.0 / sway - 1.0 / moves)
     odds = SWAYS * both_rest / (1.0 - SWAYS * both_rest) * math.exp(log_odds)
     sways, slowed = odds / (1.0 + odds), error / sway
-    spread = stated**2 * variance
+    spread = scale**2 * variance
     within = sways * SWAY**2 * spread / (SWAY**2 + spread) + (1.0 - sways) * spread
-    scale = np.repeat([1.0, math.sqrt(within / variance)], 3)
-    covariance = covariance * np.outer(scale, scale)
+    scales = np.repeat([1.0, math.sqrt(within / variance)], 3)
+    covariance = covariance * np.outer(scales, scales)
     covariance[3:, 3:] += sways * (1.0 - sways) * slowed**2 * np.outer(velocity, velocity)
     return velocity * (1.0 - sways * slowed), covariance

@@ -1,11 +1,12 @@
 """Feet for publication: resting feet stand still on the floor, and no foot is below the floor.
 
-A sensor's error in a foot's height lasts, so no filter of that foot alone can estimate it. The floor gives a second
-measurement: a standing foot is at this person's standing height above it. That measurement is applied at publication
-and not in the filter. Its error is a bias, and a filter that used it in every frame would trust it more and more.
+A sensor's error in a foot's height is constant or slow, so no filter of that foot alone can estimate it. The floor
+gives a second measurement: a standing foot is at this person's standing height above the floor. It is applied at
+publication and not in the filter, because its error is a bias: used in every frame, it would make the filter
+overconfident.
 
 While a foot stands, the filter's estimate of its position becomes more accurate and therefore creeps. The published
-position stays: half a standard deviation of distance adds only a tenth to an estimate's error.
+position stays within half a standard deviation of the estimate, which adds only a tenth to the error.
 """
 
 from __future__ import annotations
@@ -31,8 +32,7 @@ UNEVEN = 0.006
 MEMORY_S = 1.5
 """Correlation time of the error of a standing foot's height, seconds. Frames closer together repeat a measurement."""
 
-FLOOR_EASE_S = 0.05
-"""Time constant with which feet are moved to the floor, seconds. Their offset lasts longer than this."""
+FLOOR_EASE_S = 0.05  # time constant with which feet are moved to the floor, seconds
 
 AIR_M = 0.1  # range of heights above the floor assumed for feet that do not stand or stand on something else, metres
 OUTLIER = 0.05  # probability that the floor's estimate is wrong
@@ -64,7 +64,7 @@ class Feet:
         feet, spread = root.feet.copy(), root.feet_sigma.copy()
         under = np.array([floor.under(sole) for sole in feet - self._soles.heights[:, None] * _UP])
         sigma = observed.feet_sigma
-        # the filter models the sensor's error as fading, but part of it is a lasting offset of the foot
+        # the filter models the sensor's error as a decaying one, but part of it is a constant offset of the foot
         variance = spread[:, 2] ** 2 + np.where(np.isfinite(sigma), sigma, 0.0) ** 2
         raised = root.position[2] - np.nan_to_num(under)
         upright = np.clip((raised - LYING_M) / (UPRIGHT_M - LYING_M), 0.0, 1.0)

@@ -28,17 +28,18 @@ INFERRED_LEGS_SPEED = 0.5
 
 OFF_MEMORY_S = 0.5
 """Time constant of the predicted velocity's mean error against an observed root, seconds. While the root is observed,
-this error is added to the standard deviation, because some motion is unknown to the network."""
+this error is added to the standard deviation, because some motion is unlike the network's training data."""
 
 JUMP_SIGMAS, JUMP_M, JUMP_FRAMES = 5.0, 0.3, 6
 """Distance above which an observed root is rejected, standard deviations and metres, and the number of frames in a row
 after which it is accepted. A root that was unobserved before is accepted at once. The filter then starts anew."""
 
-AT_ODDS_SIGMAS, AT_ODDS_MEMORY_S = 2.0, 0.2
-"""Mean distance of the observed root above which the body is carried by what it stands on, standard deviations, and
-time constant of that mean, seconds. Feet and network then do not measure the motion in the world."""
+CARRIED_SIGMAS, CARRIED_MEMORY_S = 2.0, 0.2
+"""Mean distance of the observed root from its estimate above which the body's support is assumed to move with it (a
+lift, a vehicle), standard deviations, and time constant of this mean, seconds. Feet and network then do not measure the
+motion in the world."""
 
-AT_ONE_SPEED = 0.3  # difference between predicted and estimated velocity below which the prediction is used again, m/s
+AGREED_SPEED = 0.3  # difference between predicted and estimated velocity below which the prediction is used again, m/s
 
 _LEGS = [joint for leg in limbs(("knee", "ankle", "foot")) for joint in leg]
 _UP = np.array([0.0, 0.0, 1.0])
@@ -73,7 +74,7 @@ class RootFilter:
     def __init__(self, first: BodyObservation, noise: BodyNoise) -> None:
         self._noise, self._before = noise, first
         self._kalman = self._start(first, np.zeros(3))
-        self._shift, self._off, self._odds = np.zeros(3), np.zeros(3), np.zeros(2)
+        self._shift, self._off, self._mean_off = np.zeros(3), np.zeros(3), np.zeros(2)
         self._jumps, self._carried = 0, False
 
     @property
@@ -110,15 +111,15 @@ class RootFilter:
 
     def _observe_velocity(self, observed: BodyObservation, velocity: RootVelocity) -> None:
         """Update with the predicted velocity, unless an observed root contradicts it horizontally."""
-        kalman, share = self._kalman, 1.0 - math.exp(-observed.dt / AT_ODDS_MEMORY_S)
+        kalman, share = self._kalman, 1.0 - math.exp(-observed.dt / CARRIED_MEMORY_S)
         if not observed.root_observed:
-            self._odds[:], self._carried = 0.0, False
+            self._mean_off[:], self._carried = 0.0, False
         else:
             off = (observed.positions[0] - kalman.position)[:2]
-            self._odds += share * (off / np.hypot(kalman.position_sigma[:2], observed.root_sigma) - self._odds)
+            self._mean_off += share * (off / np.hypot(kalman.position_sigma[:2], observed.root_sigma) - self._mean_off)
             disagreement = float(np.linalg.norm((kalman.velocity - velocity.velocity)[:2]))
-            at_odds = float(np.linalg.norm(self._odds)) > AT_ODDS_SIGMAS
-            self._carried = at_odds or (self._carried and disagreement > AT_ONE_SPEED)
+            contradicted = float(np.linalg.norm(self._mean_off)) > CARRIED_SIGMAS
+            self._carried = contradicted or (self._carried and disagreement > AGREED_SPEED)
         if self._carried:
             return
         inferred = 1.0 - float(observed.observed[_LEGS].mean()) if observed.root_known else 1.0

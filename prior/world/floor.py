@@ -122,10 +122,10 @@ class Floor:
     def update(self, observed: BodyObservation, rest: Floats, guessed: Bools) -> None:
         """Update with one body's feet and their probabilities (4,) of ``rest``.
 
-        Feet that are only ``guessed`` (4,) may start a floor, because nothing else may ever, but not move one. The legs
-        of somebody who sits behind a counter are guessed to stand, deep under the floor.
+        Feet that are only ``guessed`` (4,) may initialise a floor, as there may be no other feet, but do not move a
+        known one. The legs of a person who sits behind a counter are guessed to stand, deep under the floor.
         """
-        if not self.known and observed.feet_observed.any():
+        if observed.feet_observed.any():
             self.guess(float(np.nanmin(observed.soles[:, 2])))
         if not observed.root_observed:
             return
@@ -135,7 +135,7 @@ class Floor:
             self.observe(soles[k], math.hypot(sigma[k], SOLE_SIGMA), max(observed.dt, FRAME_S))
 
     def guess(self, lowest: float) -> None:
-        """Start at the height of the lowest observed foot, metres, as if it stood on the floor."""
+        """Initialise an unknown floor as if the lowest observed foot, at this height in metres, stood on it."""
         if not self.known:
             self.height, self._variance = lowest, GUESS_SIGMA**2
 

@@ -1,15 +1,15 @@
 """The Kalman filter of a body's trajectory: position and velocity of the root, and positions of the feet.
 
-The errors of the sensor's observations and of the network's predictions are correlated in time. All biases are
-therefore part of the state. The filter does not become overconfident about a root that is observed for long, and the
-uncertainty of a coasting root grows as lasting errors make it grow.
+The errors of the sensor's observations and of the network's predictions are correlated in time. They are therefore part
+of the state. The filter does not become overconfident about a root that is observed for long, and the uncertainty of a
+coasting root grows as fast as correlated errors accumulate.
 
 The positions of the feet are part of the state as well, as in contact-aided filters of legged robots (Bloesch et al.,
-"State Estimation for Legged Robots", RSS 2012). A resting foot stays in place. If it seems to move, that is the
-sensor's error; the filter learns this error and forgets it when the foot lifts, so an anchor is eased in and out. While
-the root is hidden, the distance to the same foot measures how far the root has moved. One measurement thus serves as
-zero-velocity update and as anchor against accumulating errors, and the covariance includes the uncertainty of the
-anchor's position.
+"State Estimation for Legged Robots", RSS 2012). A resting foot stays in place. Its apparent motion is the sensor's
+error, which the filter estimates, and forgets when the foot lifts, so an anchor takes effect and ends gradually. While
+the root is hidden, the distance to the same foot measures how far the root has moved. One measurement is thus
+zero-velocity update and anchor against accumulating errors, and the covariance includes the uncertainty of the anchor's
+position.
 
 Observations are smoothed, so their errors are smooth too. Each error is the second-order Gauss-Markov process of a
 critically damped spring: after time t, (1 + wt) exp(-wt) of it is left. The axes are independent. The noise is equal in
@@ -45,8 +45,8 @@ class BodyNoise:
     load: float = 0.2
     swing: float = 4.0
     slip_at_speed: float = 0.5
-    """s/m, relative increase of the random walk of feet at rest and under load for each m/s of the root's speed. Such
-    feet roll and slide, or are wrongly taken to stand"""
+    """s/m, relative increase of the random walk of feet at rest and under load for each m/s of the root's speed, as
+    these feet roll and slide, or are wrongly taken for standing"""
     sensor_rate: float = 12.0  # 1/s, w of the sensor's errors of a point at rest
     sensor_memory_m: float = 0.03
     """metres of travel with which a moving root's error decays in addition, as a camera's error does"""
@@ -71,8 +71,8 @@ class BodyFilter:
     """Kalman filter of root position and velocity, positions of ``feet`` points of the feet, and biases.
 
     It starts from the first observed position (3,) of the root, metres, and a velocity (3,) m/s; ``jitter`` and
-    ``bias`` are deviations of the sensor's error from frame to frame and of its slow one, metres. ``placed`` (feet,)
-    says which feet have a position.
+    ``bias`` are standard deviations of the sensor's independent and of its slow error, metres. ``placed`` (feet,) is
+    which feet have a position.
     """
 
     def __init__(
@@ -142,20 +142,18 @@ class BodyFilter:
         _predict(self._x, self._p, dt, noise.density(speed), rates * dt, kept, noise.walk(load, rest, speed) * dt)
 
     def observe_position(self, position: Floats, jitter: float, bias: float) -> None:
-        """Update with an observed root position (3,) metres and the deviations of its errors: from frame to frame, and
-        slow."""
+        """Update with an observed root position (3,) metres; ``jitter`` and ``bias`` are its errors' deviations."""
         self._correct({_POSITION: 1.0, _SENSOR: bias}, position, jitter)
 
     def observe_velocity(self, velocity: Floats, jitter: ArrayLike, bias: ArrayLike) -> None:
-        """Update with the network's root velocity (3,) m/s and the deviations, (3,) or a number, of its errors: from
-        frame to frame, and slow."""
+        """Update with the network's root velocity (3,) m/s and the deviations of its errors, (3,) m/s or a number."""
         self._correct({_VELOCITY: 1.0, _NETWORK: bias}, velocity, jitter)
 
     def observe_foot(self, foot: int, place: Floats, jitter: float, bias: float, *, from_root: bool) -> None:
         """Update with the observed position (3,) metres of a foot, in the world or relative to the root.
 
-        The position has both errors of the sensor. Errors relative to the root differ from those in the world, so a
-        change between the two forgets the learned error.
+        The position has both errors of the sensor. Errors relative to the root differ from those in the world, so the
+        estimated error is forgotten when the frame changes.
         """
         if not self.placed[foot]:
             self._place(foot, place + self._x[_POSITION] if from_root else place, jitter, bias, from_root)

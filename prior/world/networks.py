@@ -1,7 +1,7 @@
 """Recurrent networks' predictions for bodies in the world: root velocity and contacts.
 
 Root velocity is predicted from the body's own motion (the task of HM-VAE, section 3.3). Contacts are predicted as load
-and rest; they decide which feet may anchor the root.
+and rest, which determine the feet that may anchor the root.
 """
 
 from __future__ import annotations

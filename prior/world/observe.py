@@ -178,8 +178,8 @@ class LegMemory:
     def update(self, observed: BodyObservation) -> Bools:
         """Return which joints of legs (6,), in the order of `LEG_CONTACTS`, are only guesses.
 
-        Ankle and toes are one foot: it is observed if one of the two is, because many sensors have no toes. A foot that
-        is observed says where its knee is.
+        A foot is observed if its ankle or its toes are, because many sensors have no toes. An observed foot also
+        determines its knee.
         """
         knees, *feet = observed.observed[_JOINTS].reshape(3, 2)
         foot = np.any(feet, axis=0)

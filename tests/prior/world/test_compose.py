@@ -208,7 +208,7 @@ def test_the_velocity_of_a_root_that_sways_is_the_mean_of_the_mixture():
     sways = weights[0] / weights.sum()
     slowed = velocity * SWAY**2 / (SWAY**2 + error**2)
     expected = sways * slowed + (1 - sways) * velocity
-    found, covariance = standing_velocity(velocity, _covariance(0.1), 1.0, stated=VELOCITY_ERROR)
+    found, covariance = standing_velocity(velocity, _covariance(0.1), 1.0, scale=VELOCITY_ERROR)
     np.testing.assert_allclose(found, expected)
     variance = sways * SWAY**2 * error**2 / (SWAY**2 + error**2) + (1 - sways) * error**2
     between = sways * np.outer(slowed - expected, slowed - expected)
@@ -218,16 +218,16 @@ def test_the_velocity_of_a_root_that_sways_is_the_mean_of_the_mixture():
 
 def test_a_root_that_moves_over_resting_feet_or_walks_keeps_its_velocity():
     bends, slow = np.array([0.0, 0.2, -0.3]), np.array([0.03, 0.0, 0.0])
-    np.testing.assert_allclose(standing_velocity(bends, _covariance(0.1), 1.0, stated=0.5)[0], bends, rtol=1e-6)
-    velocity, covariance = standing_velocity(slow, _covariance(0.1), 0.0, stated=1.0)
+    np.testing.assert_allclose(standing_velocity(bends, _covariance(0.1), 1.0, scale=0.5)[0], bends, rtol=1e-6)
+    velocity, covariance = standing_velocity(slow, _covariance(0.1), 0.0, scale=1.0)
     np.testing.assert_array_equal(velocity, slow)
     np.testing.assert_allclose(covariance, _covariance(0.1))
 
 
-@given(speed=st.floats(0, 100), sigma=st.floats(1e-6, 10), both_rest=st.floats(0, 1), stated=st.floats(0.1, 1))
-def test_no_velocity_grows_or_turns_nor_is_its_covariance_none(speed: float, sigma: float, both_rest: float, stated):
+@given(speed=st.floats(0, 100), sigma=st.floats(1e-6, 10), both_rest=st.floats(0, 1), scale=st.floats(0.1, 1))
+def test_no_velocity_grows_or_turns_nor_is_its_covariance_none(speed: float, sigma: float, both_rest: float, scale):
     direction = np.array([0.6, 0.0, 0.8])
-    slowed, covariance = standing_velocity(speed * direction, _covariance(sigma), both_rest, stated=stated)
+    slowed, covariance = standing_velocity(speed * direction, _covariance(sigma), both_rest, scale=scale)
     assert 0.0 <= slowed @ direction <= speed + 1e-9
     np.testing.assert_allclose(slowed, (slowed @ direction) * direction, atol=1e-9)
     np.testing.assert_array_equal(covariance, covariance.T)
