@@ -234,8 +234,8 @@ def _refined(points: Floats, image: Floats, lens: Intrinsics, start: Floats) -> 
     """
 
     def away(pose: Floats) -> Floats:
-        seen = cv2.projectPoints(points, pose[:3], pose[3:], lens.matrix, lens.coefficients)[0]
-        return (seen.reshape(-1, 2) - image).ravel()
+        projected = cv2.projectPoints(points, pose[:3], pose[3:], lens.matrix, lens.coefficients)[0]
+        return (projected.reshape(-1, 2) - image).ravel()
 
     fit = least_squares(away, start, loss="cauchy", f_scale=CORNER_SCALE_PX, x_scale="jac")
     turn, move = fit.x[:3], fit.x[3:]

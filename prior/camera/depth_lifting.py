@@ -9,9 +9,9 @@ also measures the skin, not joint centres. The depth of a joint is therefore
 3. moved along the ray from the skin to the joint's centre.
 
 The root is anchored at the midpoint of the hips, where the trunk fills the neighbourhood. The distance of the hips
-behind the skin depends on the trunk's turn. A trunk seen from the side hides one hip; the position of this hip follows
-from the width of the hips, and from which arm and leg are nearer. Any other joint is unobserved (NaN) if its depth is
-missing, contradicts the body, or belongs to another joint.
+behind the skin depends on the trunk's orientation. From the side, the trunk hides one hip; the position of this hip is
+computed from the width of the hips, on the side of the farther arm and leg. Any other joint is unobserved (NaN) if its
+depth is missing, contradicts the body, or belongs to another joint.
 
 Key points are those of COCO-17 (`prior.body.layouts.COCO17`).
 """
@@ -50,7 +50,7 @@ _HALF_DEPTH, _HALF_BREADTH = 0.12, 0.18
 _HIP_WIDTH, _SHOULDER_WIDTH, _TRUNK_LENGTH, _TRUNK_LENGTHS = 0.35, 0.70, 0.51, (0.42, 0.60)
 """Widths of hips and shoulders, joint to joint, in lengths of the trunk (midpoint of the shoulders to midpoint of the
 hips); the trunk's usual length and the accepted range, metres."""
-_MAX_TURN_COSINE, _HIP_SLACK, _SEEN_WIDTH = np.cos(np.radians(50)), 0.03, 0.65
+_MAX_TURN_COSINE, _HIP_SLACK, _VISIBLE_WIDTH = np.cos(np.radians(50)), 0.03, 0.65
 """Cosine of the turn above which the far hip is hidden; tolerance of a hip's depth, given the width of the hips,
 metres; share of the shoulders' width below which one shoulder is hidden."""
 _TURN_EVIDENCE, _FAR_SIDE_THRESHOLD, _CONFIDENCE_EVIDENCE = 0.10, 0.5, 0.05
@@ -122,8 +122,8 @@ def lift(keypoints: Floats, confidence: Floats, depth: NDArray[Any], intrinsics:
     positions = np.full((*confidence.shape, 3), np.nan)
     for body in range(len(keypoints)):
         positions[body] = _lift_body(np.where(known[body, :, None], keypoints[body], np.nan), confidence[body], view)
-    seen = np.isfinite(positions).all(axis=-1)
-    return positions.astype(np.float32), np.where(seen, confidence, 0.0).astype(np.float32)
+    observed = np.isfinite(positions).all(axis=-1)
+    return positions.astype(np.float32), np.where(observed, confidence, 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def _lift_body(pixels: Floats, confidence: Floats, view: _View) -> Floats:
         positions[list(_HIPS)] = hips.middle
 
     def follow(joints: Sequence[int], lengths: Sequence[float], origin: Floats) -> None:
-        """Place the joints of a chain, each within reach of the last one found."""
+        """Place the joints of a chain, each within reach of the last one placed."""
         reach = 0.0
         for joint, length in zip(joints, lengths, strict=True):
             reach += length
@@ -208,7 +208,7 @@ class _Hips:
     trunk: float  # metres, middle of the shoulders to middle of the hips
     rays: Floats  # (2, 3) through the left and the right hip
     beside: float  # metres from hip to hip across the line of sight
-    measured: float  # metres by which the left hip's skin is farther; NaN where either is not seen
+    measured: float  # metres by which the left hip's skin is farther; NaN if either is not visible
 
     @classmethod
     def find(cls, pixels: Floats, chest: Floats, trunk: float, radius: float, view: _View) -> _Hips | None:
@@ -238,7 +238,7 @@ class _Hips:
 
     @property
     def turned(self) -> bool:
-        """Whether the trunk is seen from its side."""
+        """Whether the camera looks at the trunk from its side."""
         return self.beside < _MAX_TURN_COSINE * _HIP_WIDTH * self.trunk
 
     def places(self, turn: float) -> Floats:
@@ -309,9 +309,9 @@ def _behind(ray: Floats, skin: float, to_centre: float) -> Floats:
 
 
 def _turn(positions: Floats, confidence: Floats) -> float:
-    """Return the farther side of a body seen from the side: 1 left, -1 right, 0 unknown, between if uncertain.
+    """Return the farther side of a body that stands sideways: 1 left, -1 right, 0 unknown, between if uncertain.
 
-    The depths of arms and legs decide. If these hide each other, the detector's confidences decide.
+    It is that of the farther arm and leg, or if these hide each other, of the joints with less confidence.
     """
     left, right = positions[_LIMB_ENDS[0]], positions[_LIMB_ENDS[1]]
     distinct = np.linalg.norm(left - right, axis=-1) > max(_MIN_SEPARATION.values())
@@ -319,13 +319,13 @@ def _turn(positions: Floats, confidence: Floats) -> float:
         evidence = float((left - right)[distinct, 2].mean())
         if abs(evidence) > _TURN_EVIDENCE / 3:
             return float(np.clip(evidence / _TURN_EVIDENCE, -1, 1))
-    doubt = float((confidence[_LIMB_ENDS[1]] - confidence[_LIMB_ENDS[0]]).mean())
-    return float(np.sign(doubt)) if abs(doubt) > _CONFIDENCE_EVIDENCE else 0.0
+    difference = float((confidence[_LIMB_ENDS[1]] - confidence[_LIMB_ENDS[0]]).mean())
+    return float(np.sign(difference)) if abs(difference) > _CONFIDENCE_EVIDENCE else 0.0
 
 
 def _drop_doubles(positions: Floats, confidence: Floats, turn: float, shoulder_width: float) -> None:
-    """Of coincident left and right joints, remove the hidden one: that of the far side, or the less confident one."""
-    apart = _MIN_SEPARATION | {"shoulder": _SEEN_WIDTH * shoulder_width}
+    """Remove the hidden one of coincident left and right joints: that of the far side, or the less confident one."""
+    apart = _MIN_SEPARATION | {"shoulder": _VISIBLE_WIDTH * shoulder_width}
     for name, least in apart.items():
         left, right = _K[f"left_{name}"], _K[f"right_{name}"]
         if np.linalg.norm(positions[left] - positions[right]) < least:

@@ -1,9 +1,9 @@
 """Completion of a recording: motion between key frames (in-betweening), and unobserved parts of a body.
 
 Known joints do not change, bit for bit. The completer estimates the rest with the person's bones, window by window
-(`views`). Windows overlap, and each gap lies in one window with both its ends. The completer gets known joints smoothed
-(`smoothed`), because a velocity from noisy joints throws a body off course in a gap. Measured bone lengths
-vary, so known joints are a few millimetres off these bones. This residual is interpolated between known frames.
+(`views`). Windows overlap, and each gap lies in one window with both its ends. The completer's input is smoothed
+(`smoothed`), because errors of the velocity at the edges of a gap accumulate in it. Measured bone lengths vary, so
+known joints are a few millimetres off these bones. This residual is interpolated between known frames.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def views(known: Bools) -> list[View]:
     """
     frames = len(known)
     own = np.zeros(frames)
-    found: list[View] = []
+    windows: list[View] = []
     waiting = gaps(known)
     while waiting:
         first = max(waiting[0].start - AROUND, 0)
@@ -91,11 +91,11 @@ def views(known: Bools) -> list[View]:
             weight[:rise] = (np.arange(rise) + 1.0) / (rise + 1.0)
         if fall:
             weight[-fall:] = (np.arange(fall, 0, -1)) / (fall + 1.0)
-        # a gap of which this window sees only one end is left to the window that contains both
+        # a gap of which this window contains only one end is left to the window that contains both
         for gap in gaps(known[first:last]):
             if not any(gap.start + first == whole.start and gap.end + first == whole.end for whole in waiting[:taken]):
                 weight[gap.start : gap.end] = 0.0
-        found.append(View(first, weight))
+        windows.append(View(first, weight))
         own[first:last] = np.maximum(own[first:last], weight)
         waiting = waiting[taken:]
     settled = known.all(axis=1) | (own >= 1.0)
@@ -105,16 +105,16 @@ def views(known: Bools) -> list[View]:
         for start in range(first, first + more * _HOP + 1, _HOP):
             end = min(start + LONGEST, frames)
             weight = np.minimum(np.arange(1, end - start + 1), np.arange(end - start, 0, -1)) / (end - start)
-            found.append(View(start, weight * (1.0 - own[start:end])))
-    return found
+            windows.append(View(start, weight * (1.0 - own[start:end])))
+    return windows
 
 
 MIN_SIGMA = 0.002  # least standard deviation of a given joint along an axis, metres
 MIN_NEVER = 0.015  # least standard deviation along an axis of a joint that was never given, metres
 
-_WAIST, UNSEEN_WAIST = [J["pelvis"], *HIPS], 0.12
-"""Least standard deviation along an axis of pelvis and hips if nothing from the hips down was ever given, metres
-(validation: 0.09, 0.15; the Gaussian of postures does not know how a trunk bends)."""
+_WAIST, UNOBSERVED_WAIST = [J["pelvis"], *HIPS], 0.12
+"""Least standard deviation along an axis of pelvis and hips if no joint from the hips down was ever given, metres
+(validation: 0.09, 0.15; the Gaussian of postures has too little variance for the bending of a trunk)."""
 _LOWER = np.ravel(limbs(("hip", "knee", "ankle", "foot")))
 _HEAD = [J["neck"], J["head"]]
 
@@ -157,9 +157,9 @@ class Uncertainty:
             noise[joint] = max(np.nanmedian(bends[:, joint]) / (1.538 * np.sqrt(6.0)), MIN_SIGMA)
         ever: Bools = np.asarray(known.any(axis=0))
         never = self.posture.sigma_given(ever)
-        never[_HEAD] = np.maximum(never[_HEAD], np.take(self.far, _HEAD))  # people hold it differently
+        never[_HEAD] = np.maximum(never[_HEAD], np.take(self.far, _HEAD))  # its posture varies between people
         if not ever[_LOWER].any():
-            never[_WAIST] = np.maximum(never[_WAIST], UNSEEN_WAIST)
+            never[_WAIST] = np.maximum(never[_WAIST], UNOBSERVED_WAIST)
         guessed = np.hypot(np.maximum(np.where(ever, self.far, never), MIN_NEVER) * grown, noise)
         since, until, between = since[:, :1], until[:, :1], between[:, :1]
         rootless = np.minimum(since, until) * np.minimum((since + until) / LONG, 1.0)
@@ -200,8 +200,8 @@ def complete(
     known = finite_joints(positions)
     if not known.any():
         raise ValueError("expected joints in at least one frame, all are missing")
-    seen = np.flatnonzero(known.any(axis=1))
-    reached = slice(max(int(seen[0]) - LONGEST_GAP, 0), int(seen[-1]) + 1 + LONGEST_GAP)
+    frames = np.flatnonzero(known.any(axis=1))
+    reached = slice(max(int(frames[0]) - LONGEST_GAP, 0), int(frames[-1]) + 1 + LONGEST_GAP)
     joints, rotations = np.full(positions.shape, np.nan), np.full((*positions.shape, 3), np.nan)
     joints[reached], rotations[reached] = _completed(
         fill, positions[reached], offsets, lambda frame: advanced(frame + reached.start)
@@ -282,29 +282,29 @@ def _filled(fill: Fill, positions: Floats, offsets: Floats, advanced: Callable[[
         root[rows] += view.weight[:, None] * placed[0]
         total[rows] += view.weight
         advanced(rows.stop)
-    looked_at = total > 0
+    covered = total > 0
     rotations = solve_rotations(positions, offsets)
-    rotations[looked_at] = rotations_of_6d(columns[looked_at])
-    root = np.where(looked_at[:, None], root / np.maximum(total, 1e-12)[:, None], positions[:, 0])
+    rotations[covered] = rotations_of_6d(columns[covered])
+    root = np.where(covered[:, None], root / np.maximum(total, 1e-12)[:, None], positions[:, 0])
     return rotations, root
 
 
 WHOLE, PART, LOWER_ARM = (0.5, 60.0), (0.8, 40.0), (0.8, 20.0)
-"""Share of each joint's own cubic spline in short gaps, and length of gaps without it, frames: where no joint is known,
-where others are, and for an elbow and a wrist if the shoulder is. The completer's errors accumulate along limbs, and
-those of noisy joints count many times; but a spline overshoots where a wrist turns back."""
+"""Share of each joint's own cubic spline in the shortest gaps, and length of gaps from which on it is 0, frames: where
+no joint is known, where others are, and for an elbow and a wrist if the shoulder is. The completer's errors accumulate
+along limbs; but a spline overshoots where a wrist reverses its motion."""
 
 LAG, RUN = 8, 6
-"""Number of later frames from which a known joint is smoothed, and of known frames in a row below which it is not: of
-key frames apart, a smoother takes motion for noise."""
+"""Number of later frames used to smooth a known joint, and number of known frames in a row below which it is not
+smoothed: between isolated key frames, a smoother cannot distinguish motion from noise."""
 
 
 def smoothed(positions: Floats) -> Floats:
     """Return known joints (T, 22, 3) as the live smoother estimates them, which leaves noise-free ones unchanged."""
     smoother, known = MixtureSmoother(LAG, 1), finite_joints(positions)
     lagging = [
-        smoother.update(frame[None], t / FPS, seen[None].astype(np.float64))
-        for t, (frame, seen) in enumerate(zip(positions, known, strict=True))
+        smoother.update(frame[None], t / FPS, observed[None].astype(np.float64))
+        for t, (frame, observed) in enumerate(zip(positions, known, strict=True))
     ]
     frames = [frame for frame in lagging if frame is not None] + smoother.flush()
     since, until = frames_since_and_until(np.pad(~known, ((1, 1), (0, 0)), constant_values=True))

@@ -21,8 +21,8 @@ from steadypose.prior.models.line import draw_line
 from steadypose.prior.models.weights import WeightsError, load_weights, part
 
 SHARE = 0.65
-"""Share of HG-VAE's completion in the blend where a joint is hidden from the start, to the end or throughout. Between
-observations it is proportional to the gap, for the completer is better in short ones (chosen on validation,
+"""Share of HG-VAE's completion in the blend for a joint that is hidden from the start, to the end or throughout.
+Between observations it is proportional to the gap, because the completer is better in short gaps (chosen on validation,
 benchmarks/NOTEBOOK.md)."""
 
 SMOOTH = 3.0
@@ -60,10 +60,10 @@ class PartsCompleter:
             share = SHARE * correction_share(draw_line(known[None]))[0]
             joints = first + share * gaussian_filter1d(second - first, SMOOTH, axis=0, mode="nearest")
             # within a gap, joints that are known in other frames come from the completer alone
-            asked = ~known & (partly[:, None] | ~known.any(axis=0))
-            some = asked.any(axis=1)
-            joints = np.where(known[..., None], given, np.where(asked[..., None], joints, first))[some]
-            joints = fit_lengths(joints, bones, np.where(asked[some], 1.0, HELD))
+            replaced = ~known & (partly[:, None] | ~known.any(axis=0))
+            some = replaced.any(axis=1)
+            joints = np.where(known[..., None], given, np.where(replaced[..., None], joints, first))[some]
+            joints = fit_lengths(joints, bones, np.where(replaced[some], 1.0, HELD))
             rotations[row, some] = solve_rotations(joints, bones, rotations[row, some])
         return rotations, root
 

@@ -1,9 +1,9 @@
-"""Draws alternatives to a completed motion, because what was not observed could have been otherwise.
+"""Draws alternatives to a completed motion: samples of what was not observed.
 
-A completion is one motion, the expected one. An alternative differs from it by a smooth Gaussian process. The
-differences of joints are correlated as in the Gaussian of postures, given the known joints, and their standard
-deviations are the published ones. So alternatives are about as far from the completion as the truth is, and known
-joints do not change.
+A completion is the expected motion. An alternative differs from it by a smooth Gaussian process. The differences of
+joints are correlated as in the Gaussian of postures, given the known joints, and their standard deviations are the
+published ones. Alternatives are therefore about as far from the completion as the truth is, and known joints do not
+change.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SMOOTH = 30.0
 real ones do."""
 
 CHANGE = 3.0
-"""The same of the process given what is known, frames; joints appear and disappear from one frame to the next."""
+"""The same for the process given the known joints, frames, which appear and disappear from one frame to the next."""
 
 EASE = 8.0  # time in which an alternative parts from a joint's last observation, frames
 KNOWN_SIGMA = 0.02  # standard deviation along an axis of a known joint's difference from a posture, metres of an adult
@@ -34,8 +34,8 @@ def draw(
 ) -> Completed:
     """Draw an alternative to a completion of T frames, with deviations (T, 22) metres along an axis and bones (22, 3).
 
-    ``covariance`` (66, 66) is of joints in the trunk's frame (`LivePosture.covariance`). Frames without positions stay
-    so.
+    ``covariance`` (66, 66) is of joints in the trunk's frame (`LivePosture.covariance`). Frames without positions do
+    not change.
     """
     rows = np.isfinite(completed.positions).all(axis=(1, 2))
     joints, known = completed.positions[rows], completed.known[rows]
@@ -67,13 +67,13 @@ def _differences(known: Bools, covariance: Floats, random: np.random.Generator) 
     given = np.empty_like(drawn)
     masks, which = np.unique(known, axis=0, return_inverse=True)
     for k, mask in enumerate(masks):
-        rows, seen = which.ravel() == k, np.repeat(mask, 3)
+        rows, fixed = which.ravel() == k, np.repeat(mask, 3)
         left = covariance
         off = drawn[rows]
-        if seen.any():
-            noisy = covariance[np.ix_(seen, seen)] + KNOWN_SIGMA**2 * np.eye(int(seen.sum()))
-            gain = np.linalg.solve(noisy, covariance[seen]).T
-            off = off - off[:, seen] @ gain.T
-            left = covariance - gain @ covariance[seen]
+        if fixed.any():
+            noisy = covariance[np.ix_(fixed, fixed)] + KNOWN_SIGMA**2 * np.eye(int(fixed.sum()))
+            gain = np.linalg.solve(noisy, covariance[fixed]).T
+            off = off - off[:, fixed] @ gain.T
+            left = covariance - gain @ covariance[fixed]
         given[rows] = off / np.sqrt(np.maximum(np.diag(left), 1e-8))
     return gaussian_filter1d(given, CHANGE, axis=0, mode="nearest")

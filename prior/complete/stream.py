@@ -144,18 +144,18 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
             if newer and finite_joints(joints).any():
                 stamps[body.id].append(message.stamp_ns)
                 positions[body.id].append(sensor.to_world(joints))
-    found = [
+    stretches = [
         stretch
         for body in stamps
         if stamps[body]
         for stretch in _on_grid(body, np.array(stamps[body]), np.stack(positions[body]), anchor_ns)
     ]
-    if not found:
+    if not stretches:
         raise CompletionError(
             f"{source}: expected a body with joints in some frame, got none; see what it holds: "
             f"steadypose info {source}"
         )
-    return found
+    return stretches
 
 
 def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns: int) -> list[Stretch]:
@@ -168,7 +168,7 @@ def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns:
             "or see whether the skeleton is the right one"
         )
     ends = np.flatnonzero(np.diff(stamps) > APART_NS) + 1
-    found = []
+    stretches = []
     for rows in np.split(np.arange(len(stamps)), ends):
         first, last = (round((int(stamps[row]) - anchor_ns) / PERIOD_NS) for row in (rows[0], rows[-1]))
         ticks = anchor_ns + np.arange(first, last + 1) * PERIOD_NS
@@ -177,8 +177,8 @@ def _on_grid(body: int, stamps: NDArray[np.int64], positions: Floats, anchor_ns:
             usable = rows[np.isfinite(positions[rows, joint]).all(axis=-1)]
             if len(usable):
                 given[:, joint] = interpolated(stamps[usable], positions[usable, joint], ticks)
-        found.append(Stretch(body, first, given, offsets))
-    return found
+        stretches.append(Stretch(body, first, given, offsets))
+    return stretches
 
 
 def interpolated(stamps: NDArray[np.int64], places: Floats, ticks: NDArray[np.int64]) -> Floats:
