@@ -117,7 +117,7 @@ class EventDetector:
             world: a message of ``pose/world``. A message whose stamp is not after the last starts the stream anew.
             sensor: (3,) metres, world, the position that people come near to and face. The default is the origin, above
                 which an uncalibrated sensor is.
-            calibrated: whether the sensor's position is known, and so the floor, even under legs that nobody sees.
+            calibrated: whether the sensor's position is known, and so the floor, even under unobserved legs.
         """
         if world.end_of_stream or world.stamp_ns <= self._stamp_ns:
             self._bodies.clear()

@@ -2,7 +2,7 @@
 
 Most are differences between joints of the same body, in the z-up world frame, so that drift of the body's position
 affects only the distance to the sensor. If both legs are only guesses, as behind a counter, the height of the hips over
-a known floor says whether a body stands or sits.
+a known floor determines whether a body stands or sits.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Arm(NamedTuple):
     lift: float
     """Angle between the line from shoulder to wrist and the nearer vertical, radians."""
     swing: float
-    """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, because guesses shake."""
+    """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, because guesses jitter."""
     up: bool
     """Whether the hand is at least as high as the chest."""
     upright: bool

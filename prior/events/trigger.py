@@ -45,8 +45,8 @@ class Trigger:
         self.confidence = 0.0
 
     def update(self, stamp_ns: int, value: float, sigma: float, possible: bool = True) -> bool:
-        """Process the next value and its standard deviation; returns whether the condition has begun or ended. Of NaN,
-        nothing begins or ends. Without its other requirements (``possible``), a condition ends."""
+        """Process the next value and its standard deviation; returns whether the condition has begun or ended. A NaN
+        changes nothing. If its other requirements are not met (not ``possible``), a condition ends."""
         self.confidence = probability_above(value, sigma, 0.5 * (self._on + self._off))
         doubt = self._sigmas * sigma
         begins, ends = possible and value - doubt > self._on, not possible or value + doubt < self._off
@@ -68,8 +68,8 @@ SWINGS = 2
 """Number of swings of a wave: out and back. If they are not about upright, one more is needed, because an arm that is
 raised to the side and lowered also starts like this."""
 OUT = 0.45
-"""Least size of a wave's first swing, as a fraction of the others': it begins in the middle, and smoothing takes the
-most from it."""
+"""Least size of a wave's first swing, as a fraction of the others': it begins in the middle, and smoothing reduces it
+most."""
 CENTRED = 0.45  # largest mean angle from upright of two swings about upright, radians
 SPEED, SPEED_NS = 1.0, 140_000_000
 """Least speed of the forearm when a swing counts, radians per second, and the time over which it is measured,
@@ -156,11 +156,8 @@ class Wave:
 
 
 class RandomWalk:
-    """A random-walk Kalman filter of a quantity that a sensor shakes by more than people change it, ``change`` (RMS) in
-    one second.
-
-    All coordinates are filtered alike. The more accurate the observations, the less it averages.
-    """
+    """A random-walk Kalman filter of a quantity whose observations have more noise than people's motion causes change:
+    ``change`` (RMS) in one second. All coordinates are filtered alike."""
 
     def __init__(self, change: float) -> None:
         self._density = change * change

@@ -3,8 +3,8 @@
 This is our own reader; `docs/results/`, "Importers", compares packages. The format does not define what a position
 channel means. In the original definition, it is added to the joint's OFFSET. Exporters that give every joint position
 channels write the whole offset into them, so there it replaces the OFFSET. Here it is added at a root, where the two
-differ only by a constant shift of the world (`prior.mocap.files` tells which has the feet on the floor), and replaces
-the OFFSET elsewhere.
+differ only by a constant shift of the world (`prior.mocap.files` selects the one with the feet on the floor), and
+replaces the OFFSET elsewhere.
 """
 
 from __future__ import annotations
@@ -122,9 +122,9 @@ def read_bvh(text: str) -> Bvh:
     Raises:
         MotionError: it is no BVH file, or its motion does not match its hierarchy.
     """
-    head, found, motion = text.partition("MOTION")
+    head, keyword, motion = text.partition("MOTION")
     last = text.rstrip().count("\n") + 1
-    if not found:
+    if not keyword:
         raise MotionError(f"expected HIERARCHY and MOTION sections, found no MOTION up to the end on line {last}")
     nodes = _hierarchy(head)
     values, fps = _motion(motion, sum(len(n.channels) for n in nodes), last)

@@ -124,7 +124,7 @@ def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str
 
 
 def _text(content: bytes) -> str:
-    """Decode a text file: UTF-16 if its mark says so, as Windows' "Unicode" does, else UTF-8."""
+    """Decode a text file: UTF-16 if it begins with that byte order mark, as Windows' "Unicode" does, else UTF-8."""
     return content.decode("utf-16" if content[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig", "replace")
 
 
@@ -236,7 +236,7 @@ def _c3d(content: bytes, description: Description) -> _Read:
 
 
 def _c3d_frames(content: bytes) -> int:
-    """Number of frames that a C3D's header states, 65535 at most; what ezc3d returns for it is what it found."""
+    """Number of frames that a C3D's header states, 65535 at most; ezc3d returns the number that it has read."""
     big_endian = content[512 * (content[0] - 1) + 3] == 86
     first, last = struct.unpack_from(">HH" if big_endian else "<HH", content, 6)
     return last - first + 1

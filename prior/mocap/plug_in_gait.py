@@ -133,7 +133,7 @@ def _limb_axes(upper: Array, m: Markers, hinge: _Hinge) -> tuple[Array, Array, A
 
 
 def _chord(upper: Array, marker: Array, along: Array, lateral: Array, offset: float) -> Array:
-    """Joint at ``offset`` from its marker, away from ``lateral``, that sees marker and upper joint at 90 degrees."""
+    """Joint at ``offset`` from its marker, away from ``lateral``, with 90 degrees between marker and upper joint."""
     cos = offset / np.linalg.norm(upper - marker, axis=-1, keepdims=True)
     return marker + offset * (cos * along - np.sqrt(1 - cos**2) * lateral)
 

@@ -222,13 +222,13 @@ def _track(
     suspects = (to_wall | to_flesh) & (rng.random(reach.shape) < 0.6)
     scale = np.where(suspects, np.maximum(scale, 0.12), scale)
 
-    seen = points + np.einsum("tjk,tjkx->tjx", error, ray_axes(points - eye))
-    optical = (seen - eye) @ camera.orientation
+    observed = points + np.einsum("tjk,tjkx->tjx", error, ray_axes(points - eye))
+    optical = (observed - eye) @ camera.orientation
     outside = ~camera.in_view((truth - eye) @ camera.orientation)
     lost = given_up | outside | (optical[..., 2] < camera.near)
     positions = np.where(lost[..., None], np.nan, optical)
     confidence = np.where(lost, 0.0, confidence_of(scale, rng))
-    reported = _found((~outside & (hidden < 0.5)).mean(axis=1) >= _MIN_JOINTS, times)
+    reported = _reported((~outside & (hidden < 0.5)).mean(axis=1) >= _MIN_JOINTS, times)
     return _Track(positions, confidence, reported)
 
 
@@ -264,7 +264,7 @@ def _bursts(dt: Floats, rate: Floats, rng: np.random.Generator) -> Bools:
     return on
 
 
-def _found(visible: Bools, times: Floats) -> Bools:
+def _reported(visible: Bools, times: Floats) -> Bools:
     """When a body is reported: once it has been visible for a while, until it is not."""
     appears = visible & ~np.concatenate([[True], visible[:-1]])  # what is visible at the start was so before
     began = np.maximum.accumulate(np.where(appears, times, times[0] - 1.0))
@@ -274,12 +274,12 @@ def _found(visible: Bools, times: Floats) -> Bools:
 def _ids(reported: Sequence[Bools], times: Floats) -> list[NDArray[np.int64]]:
     """(T,) track ids of each body, counted up as bodies appear; a new id after a long absence."""
     ids = [np.zeros(len(times), dtype=np.int64) for _ in reported]
-    current, last_seen, next_id = [0] * len(reported), [-np.inf] * len(reported), 1
+    current, last_reported, next_id = [0] * len(reported), [-np.inf] * len(reported), 1
     for t, time in enumerate(times):
         for k, there in enumerate(reported):
             if there[t]:
-                if time - last_seen[k] > _FORGET_AFTER:
+                if time - last_reported[k] > _FORGET_AFTER:
                     current[k], next_id = next_id, next_id + 1
-                last_seen[k] = time
+                last_reported[k] = time
                 ids[k][t] = current[k]
     return ids

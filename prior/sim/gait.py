@@ -74,8 +74,7 @@ LIFT, LAND = 0.05, 0.45
 HEEL_OFF_BEFORE_LIFT = 0.22
 FLAT_AFTER_LAND = 0.08
 UNDER_AFTER_LAND = 0.255
-"""Phase from landing until the pelvis passes over the ankle, a little before mid-stance, as legs trail more than
-lead."""
+"""Phase from landing until the pelvis passes over the ankle, a little before mid-stance."""
 
 _RAMP_S = 1.0  # time from standing to full speed, seconds
 _REFERENCE_SPEED = 1.2  # speed at which an adult makes 0.9 strides per second, m/s
@@ -168,7 +167,7 @@ def _turn(place: Floats, facing: float, part: Turn) -> tuple[Floats, Floats, Flo
 
 
 def _phase(before: float, speed: Floats, heading: Floats) -> Floats:
-    """Return strides, from half stride to half stride. Slow steps are short, not rare."""
+    """Return strides, from half stride to half stride. Slow steps are shorter rather than less frequent."""
     effort = np.hypot(speed, _TURN_ARM * np.gradient(heading) * RATE)
     cadence = _REFERENCE_CADENCE * (effort / _REFERENCE_SPEED) ** 0.4
     strides = np.cumsum(cadence) / RATE

@@ -117,7 +117,7 @@ def perform(intent: Intent, offsets: Floats, rng: np.random.Generator) -> Motion
     effort = plan.speed / 1.2
     step, stride = np.sin(angle) * effort, np.cos(angle) * effort
 
-    # Idle drift dies away in walking, where it would fight the gait.
+    # idle drift vanishes in walking, where it would disturb the gait
     still = 1.0 / (1.0 + (4 * effort) ** 2)
     idle_shift = drift(rng, plan.times, [0.006, 0.012], 12.0, 2.5) * still[:, None]
     idle_torso = drift(rng, plan.times, np.radians([1.0, 1.0, 1.8]), 10.0, 2.0)
@@ -286,7 +286,7 @@ def _arm(rotations: Floats, root: Floats, offsets: Floats, side: Side, intent: I
 
 
 def _within_reach(vector: Floats, full: float) -> Floats:
-    """Shorten vectors (T, 3), increasingly beyond 92 % of a limb's ``full`` length, so that it never snaps straight."""
+    """Shorten vectors (T, 3), increasingly beyond 92 % of a limb's ``full`` length, so that it straightens smoothly."""
     far = np.linalg.norm(vector, axis=-1, keepdims=True)
     free, room = 0.92 * full, 0.065 * full
     soft = free + room * (1 - np.exp(-np.maximum(far - free, 0) / room))

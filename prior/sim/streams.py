@@ -137,7 +137,7 @@ def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) ->
     stamps = np.arange(first_ns, last_ns + 1, PERIOD_NS)
     times = (stamps - START_NS) / 1e9
     at = [m.at(times) for m in people]
-    seen = [_seen(m, at, stream.camera) for m in at]
+    visible = [_visible(m, at, stream.camera) for m in at]
     quaternions = [Rotation.from_matrix(m.rotations.reshape(-1, 3, 3)).as_quat().reshape(-1, 22, 4) for m in at]
     velocities = [np.stack([np.interp(times, m.times, v) for v in m.velocity.T], axis=-1) for m in people]
     messages: list[PoseWorld] = []
@@ -151,7 +151,7 @@ def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) ->
                 covariance=np.zeros((6, 6)),
                 positions=m.positions[t],
                 rotations=quaternions[k][t],
-                state=np.where(seen[k][t], JointState.SEEN, JointState.IMPUTED),
+                state=np.where(visible[k][t], JointState.SEEN, JointState.IMPUTED),
                 sigma=np.zeros(22),
                 contacts=m.contacts[t].astype(np.float32),
                 tracking=Tracking.OK,
@@ -162,7 +162,7 @@ def _truth(people: list[Motion], stream: Stream, first_ns: int, last_ns: int) ->
     return messages
 
 
-def _seen(person: Motion, people: list[Motion], camera: Camera) -> Bools:
+def _visible(person: Motion, people: list[Motion], camera: Camera) -> Bools:
     """(T, 22) whether each joint is in view and not hidden."""
     eye = np.array(camera.position)
     hidden = as_tracked(sight(person.positions, people, eye).hidden, mount("smpl22"))
