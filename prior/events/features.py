@@ -66,7 +66,7 @@ class Arm(NamedTuple):
     lift: float
     """Angle between the line from shoulder to wrist and the nearer vertical, radians."""
     swing: float
-    """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, because guesses jitter."""
+    """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, as guesses jitter."""
     up: bool
     """Whether the hand is at least as high as the chest."""
     upright: bool

@@ -37,7 +37,7 @@ WORSE, WORSE_M = 2.0, 0.02
 ELSEWHERE, ELSEWHERE_SHARE, STILL = 0.1, 0.4, 0.3
 """Thresholds for a body on stairs or a chair: distance of the lower foot from the floor, metres; least share of the
 frames with that distance among those in which the foot is slow; and largest speed of a slow foot, m/s. The motion model
-has only one floor, and would pull feet to it."""
+has only one floor, to which it would move the feet."""
 
 _MEDIAN_NORM, _THIRD = 1.538, np.sqrt(20.0)
 """Median length of a standard normal 3D vector, and standard deviation of third differences of unit white noise."""
@@ -261,7 +261,7 @@ def _fitted_world(fit: Fit, row: int, body: WorldBody) -> WorldBody:
     around = slice(max(row - 1, 0), row + 2)
     velocity = np.gradient(joints[around, 0], 1e-9 * FRAME_NS, axis=0)[min(row, 1)]
     turned = quaternions(track.rotations[row])
-    # a foot whose contacts `pose/world` does not know is only guessed in a fit too
+    # a foot whose contacts are unknown in `pose/world` is only guessed in a fit too
     load = np.where(np.isnan(track.load[row]) | np.isnan(body.contacts), body.contacts, track.load[row])
     return replace(
         body, root_position=joints[row, 0], root_orientation=turned[0], root_velocity=velocity, positions=joints[row],

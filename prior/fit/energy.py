@@ -103,7 +103,7 @@ class FirstState(Quadratic):
 
 @dataclass(frozen=True)
 class Smooth(Quadratic):
-    """E_smooth, of the joints' accelerations: a motion prior without knowledge of bodies."""
+    """E_smooth, of the joints' accelerations: a motion prior without a body model."""
 
     sigma: float | Tensor = 4.0
     """m/s² along an axis; one for all, or one for each joint of each frame but the first and last, (T - 2, 22)"""
@@ -140,7 +140,8 @@ class Ground(Quadratic):
 class Standing(Quadratic):
     """E_env: joints in contact do not move and are at their contact height; no foot is below the ground.
 
-    The decoder's contact probabilities weigh the term, detached. Otherwise, having no contacts would be cheapest.
+    The term is weighted by the decoder's contact probabilities, detached. With a gradient, the least energy would be
+    that without contacts.
     """
 
     speed_sigma: float = 0.1  # m/s along an axis, standard deviation of the velocity of a joint in contact

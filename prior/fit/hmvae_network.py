@@ -185,13 +185,13 @@ class HMVAE(nn.Module):
         return self.placed(self.decode(posterior.local_mean, posterior.global_mean), x)
 
     def placed(self, decoded: Tensor, x: Tensor) -> Tensor:
-        """Windows (B, T, 22, 6): the deviations decoded from the mean pose of windows x, if it is about that."""
+        """Convert `decode`'s output to windows (B, T, 22, 6): with ``about_mean``, deviations from the mean of x."""
         if not self.config.about_mean:
             return decoded
         return _columns(decoded * DEVIATION + decoded.new_tensor(NO_ROTATION), _mean_pose(x).mT)
 
     def _seen(self, x: Tensor) -> Tensor:
-        """What the encoder sees of windows x: (B, T, 22, features)."""
+        """(B, T, 22, features) the encoder's input from windows x."""
         if not self.config.about_mean:
             return x
         mean = _mean_pose(x)
@@ -210,7 +210,7 @@ class HMVAE(nn.Module):
         return Posterior(*self.to_local(local).chunk(2, dim=-1), *self.to_global(features).chunk(2, dim=-1))
 
     def decode(self, local: Tensor, deep: Tensor) -> Tensor:
-        """What `placed` makes windows of, (B, T, 22, 6), of z_l (B, E1, d) and z_g (B, E4, d)."""
+        """Decode z_l (B, E1, d) and z_g (B, E4, d) to (B, T, 22, 6), the input of `placed`."""
         features = self.from_global(deep).reshape(deep.shape[0], -1, self.steps[4])
         local_features = self.from_local(local).reshape(local.shape[0], -1, self.steps[1])
         for k, block in zip(reversed(range(4)), self.decoder, strict=True):
@@ -228,8 +228,8 @@ class HMVAE(nn.Module):
 def _mean_pose(x: Tensor) -> Tensor:
     """(B, 1, 22, 3, 3) local rotations: the mean pose of windows x (B, T, 22, 6).
 
-    Bones' orientations in space are averaged: an error of a thigh's twist, which cannot be seen on a straight leg, is
-    taken back by the knee frame by frame, but not by the mean of the knee's own rotations.
+    It is the mean of the bones' orientations in space. A straight leg does not show the thigh's twist, whose error the
+    knee's rotation compensates in each frame. The mean of the knee's local rotations would not compensate it.
     """
     rotations = from_6d(x)
     _, orientations = forward_kinematics(rotations, rotations.new_zeros(1, 3).expand(len(PARENTS), 3))

@@ -23,8 +23,8 @@ CLEAR = 3.0
 MOST_POINTS = 200  # largest number of surface points per frame that are fitted
 
 POINT_SHARE = 0.03
-"""Weight of a surface point if there are 3D joints. The errors of capsules and of a depth camera last, so that many
-points in many frames would outvote correct joints (benchmarks/NOTEBOOK.md)."""
+"""Weight of a surface point if there are 3D joints. The errors of capsules and of a depth camera are correlated in
+space and time, so many points in many frames would outweigh correct joints (benchmarks/NOTEBOOK.md)."""
 
 POINT_SIGMA = 0.05
 """Standard deviation of surface points, metres: error of a depth camera at five metres, and of capsules as a body
@@ -119,8 +119,9 @@ _RADII = torch.tensor([radius for _, _, radius in CAPSULES])
 class SurfacePoints:
     """E_data of a depth camera's points: the distance of each from the visible side of the nearest bone's capsule.
 
-    A camera sees only the side of a body that faces it. With the distance from a closed surface, a point that noise
-    puts behind a limb's centre would pull towards the limb's back, and the points in front would then bias the body.
+    A camera measures only the side of a body that faces it. With the distance from a closed surface, a point that is
+    behind a limb's centre because of noise would attract the limb's back side, and the points in front would then bias
+    the body.
     """
 
     points: Tensor  # (T, N, 3) metres, world, padded with NaN

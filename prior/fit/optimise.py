@@ -3,7 +3,7 @@ too.
 
 The paper starts from random latents; here, they are encoded from the completer's output. There are three differences
 from the official code: losses are means over known entries only, the best iterate is kept instead of the last, and the
-output meets the known poses without a step, where the official code overwrites key frames. It needs torch.
+output is continuous at the known poses, where the official code overwrites key frames. It needs torch.
 """
 
 from __future__ import annotations

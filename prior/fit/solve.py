@@ -1,8 +1,8 @@
-"""The three stages of test-time optimisation (HuMoR, section 4.3), by L-BFGS, of which the last must earn its place.
+"""The three stages of test-time optimisation (HuMoR, section 4.3), by L-BFGS. The last is kept only if it fits.
 
-HuMoR's stage 3 is accurate where people move as in its training data and too stiff where they do not: of dancers, its
-error is above that of the input. This shows in the observations, so stage 3 is kept only if it explains them nearly as
-well as stage 2 (the discrepancy principle, Morozov 1966).
+HuMoR's stage 3 is accurate for motion like its training data, and too stiff for other motion: for dancers, its error
+exceeds that of the input. The residuals of the observations show this, so stage 3 is kept only if it explains them
+nearly as well as stage 2 (the discrepancy principle, Morozov 1966).
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _stages(start: Start, given: Sequence[Term], settings: FitSettings) -> list[
 def _accelerations(start: Start) -> Tensor:
     """(T - 2, 22) m/s² along an axis, median over `WINDOW` frames of the initial poses' accelerations.
 
-    A jump, where a joint is lost or found, is no motion; the median leaves it out.
+    A jump at the beginning or end of a joint's observations is no motion; the median ignores it.
     """
     joints = forward_kinematics(start.rotations, start.offsets, start.root)[0]
     size = (joints.diff(n=2, dim=0) * FPS**2).square().mean(dim=-1).sqrt()
