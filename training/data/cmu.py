@@ -137,7 +137,7 @@ def read_asf(text: str) -> Asf:
 def read_amc(text: str, skeleton: Asf) -> NDArray[np.float64]:
     """Read an Acclaim motion, (T, J, 3) metres in the axes of the subject's skeleton (y up in CMU's).
 
-    The file does not tell its frame rate; CMU's are 120 Hz. Raises MotionError if it is no AMC, or its bones are not
+    The file does not contain its frame rate; CMU's are 120 Hz. Raises MotionError if it is no AMC, or its bones are not
     the skeleton's.
     """
     angles = _frames(text)

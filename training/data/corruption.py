@@ -172,15 +172,13 @@ def jumps(window: Floats, part: slice, joints: list[int], other: Floats, rng: Rn
 
 
 def occlude(positions: Floats, rng: Rng) -> Floats:
-    """Hide joints (NaN) of windows (B, T, 22, 3) in the way that cameras lose them.
-
-    It hides limbs, the lower body, subtrees, what lies below a counter or beyond an edge of the picture, random sets of
-    joints, single entries, joints that a sensor lacks, and all frames before a body entered. Half of the gaps reach the
-    newest frame, which matters most.
+    """Hide joints (NaN) of windows (B, T, 22, 3) in the way that cameras lose them: limbs, the lower body, subtrees,
+    joints below a counter or beyond an edge of the image, random sets of joints, single entries, joints that a sensor
+    lacks, and all frames before a body entered. Half of the gaps reach the newest frame, which matters most.
     """
-    seen = positions.copy()
+    observed = positions.copy()
     frames = positions.shape[1]
-    for window in seen:
+    for window in observed:
         if rng.random() < 0.4:
             window[:, ABSENT] = np.nan
         if rng.random() < 0.25:
@@ -204,7 +202,7 @@ def occlude(positions: Floats, rng: Rng) -> Floats:
             window[rng.random(window.shape[:2]) < 10 ** rng.uniform(-3, -0.3)] = np.nan
         if rng.random() < 0.15:
             window[: rng.integers(1, frames - 3)] = np.nan
-    return seen
+    return observed
 
 
 def hide_joints(positions: Floats, count: int, rng: Rng) -> Floats:

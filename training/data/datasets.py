@@ -65,8 +65,8 @@ this offset, two recordings of one length differ by 0.4 to 2.5 degrees, and the 
 
 NORMALISED = "first2s"
 """Folder of `cmu_more` whose takes are all stretched to 240 frames. Walks and runs there all take one step per second.
-Takes that are also in `cmu_more` itself match it at 0.5 to 0.6 of their speed, jumps at 1.3 to 2. No file states the
-factor, and motion at a wrong speed would teach wrong speeds."""
+Takes that are also in `cmu_more` itself match it at 0.5 to 0.6 of their speed, jumps at 1.3 to 2. No file contains the
+factor, and networks would learn wrong speeds."""
 
 Split = Literal["train", "val", "test"]  # split of a recording; nothing may be chosen on ``test``
 

@@ -61,7 +61,9 @@ class Prepared:
 
     def __post_init__(self) -> None:
         if (self.weights, self.split) == ("measure", "train"):
-            raise MotionError(f"{self.clip.name}: expected what only measures to validate or test, it is to train")
+            raise MotionError(
+                f"{self.clip.name}: expected a split val or test for a source that only measures, got train"
+            )
 
 
 def at_speed(clip: Clip, speed: float) -> Clip | None:
@@ -135,13 +137,13 @@ def fill_gaps(positions: NDArray[np.float64], fps: float) -> NDArray[np.float64]
     lost = ~finite_joints(positions)
     time = np.arange(len(positions))
     for joint in np.flatnonzero(lost.any(axis=0)):
-        seen = ~lost[:, joint]
+        observed = ~lost[:, joint]
         for start, stop in runs(lost[:, joint]):
             filled[start:stop, joint] = np.nan
             if start > 0 and stop < len(positions) and (stop - start) / fps <= MAX_GAP:
                 for axis in range(3):
                     filled[start:stop, joint, axis] = np.interp(
-                        time[start:stop], time[seen], positions[seen, joint, axis]
+                        time[start:stop], time[observed], positions[observed, joint, axis]
                     )
     return filled
 

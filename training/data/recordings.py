@@ -67,7 +67,7 @@ def write_arrays(mocap: Path, out: Path) -> Path:
     """
     if (out / "pairs.npz").is_file():
         return out
-    found: dict[str, list[tuple[str, float, NDArray[np.float32]]]] = {"train": [], "val": []}
+    by_split: dict[str, list[tuple[str, float, NDArray[np.float32]]]] = {"train": [], "val": []}
     for data in DATA_SETS:
         if data.name not in _FREE:
             continue
@@ -76,13 +76,13 @@ def write_arrays(mocap: Path, out: Path) -> Path:
                 if not isinstance(clip, Clip):
                     continue
                 split = data.split(clip)
-                if split in found:
-                    found[split] += [(data.name, *one) for one in _at_speeds(clip, SPEEDS)]
-    for split, clips in found.items():
+                if split in by_split:
+                    by_split[split] += [(data.name, *part) for part in _at_speeds(clip)]
+    for split, clips in by_split.items():
         if not clips:
             raise MotionError(f"{mocap}: expected motion capture of {', '.join(sorted(_FREE))}; none is for '{split}'")
     out.mkdir(parents=True, exist_ok=True)
-    for split, clips in found.items():
+    for split, clips in by_split.items():
         lengths = [len(positions) for _, _, positions in clips]
         np.savez(
             out / f"motion-{split}.npz",
@@ -108,8 +108,8 @@ def load_kinect(arrays: Path, split: str) -> Pairs:
         return Pairs(**data).of(TRAIN_SUBJECTS if split == "train" else VALIDATION_SUBJECTS)
 
 
-def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, NDArray[np.float32]]]:
-    """Yield the faultless parts of a recording, sped up and resampled to 30 Hz."""
+def _at_speeds(clip: Clip) -> Iterator[tuple[float, NDArray[np.float32]]]:
+    """Yield the faultless parts of a recording at `SPEEDS`, resampled to 30 Hz."""
     clip = clip.canonical()
     if clip.seconds < 1.0:
         return
@@ -119,7 +119,7 @@ def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, N
             continue
         slow = resample(filled[first:last], clip.fps)
         bad, _ = find_faults(slow)
-        for speed in speeds:
+        for speed in SPEEDS:
             fast = resample(filled[first:last], clip.fps * speed)
             faulty = bad[np.minimum((np.arange(len(fast)) * speed).astype(int), len(bad) - 1)]
             for a, b in runs(~faulty):
@@ -128,7 +128,7 @@ def _at_speeds(clip: Clip, speeds: tuple[float, ...]) -> Iterator[tuple[float, N
 
 
 def _pairs(path: Path) -> Pairs:
-    seen, truth, names = [], [], []
+    observed, truth, names = [], [], []
     for subject in (*TRAIN_SUBJECTS, *VALIDATION_SUBJECTS):
         clips = [pair for pair in load_pairs(path, [subject]) if pair.fps == FPS and len(pair.kinect) >= FPS]
         aligned = []
@@ -143,11 +143,11 @@ def _pairs(path: Path) -> Pairs:
         ]
         offset = np.nanmedian(np.concatenate(apart), axis=0)
         for frame, kinect, pair in zip(frames, aligned, clips, strict=True):
-            seen.append(kinect.astype(np.float32))
+            observed.append(kinect.astype(np.float32))
             truth.append((pair.vicon + np.einsum("tab,jb->tja", frame, offset)).astype(np.float32))
             names.append(subject)
-    start = np.concatenate([[0], np.cumsum([len(s) for s in seen])])
-    return Pairs(np.concatenate(seen), np.concatenate(truth), start, np.array(names))
+    start = np.concatenate([[0], np.cumsum([len(s) for s in observed])])
+    return Pairs(np.concatenate(observed), np.concatenate(truth), start, np.array(names))
 
 
 def trunk_frame(joints: Floats, corners: Sequence[int] = (*HIPS, *SHOULDERS)) -> Floats:

@@ -41,7 +41,7 @@ _LIMBS = limbs(_SWINGS[0], _SWINGS[2])
 class Sensed:
     """Clips as observed by simulated sensors."""
 
-    seen: Floats  # (C, T, 22, 3) metres, NaN where unobserved
+    observed: Floats  # (C, T, 22, 3) metres, NaN where unobserved
     truth: Floats  # (C, T, 22, 3) metres, NaN where unknown
     confidence: Floats  # (C, T, 22) the sensor's, 0 to 1; in 70 % of clips, the noise is inversely proportional
 
@@ -72,23 +72,23 @@ class Sensors:
         """Draw ``count`` clips."""
         kind = rng.choice(len(KINDS), count, p=SHARES)
         truth = self._true(count, rng)
-        seen = truth.copy()
+        observed = truth.copy()
         confidence = _confidences(count, self._frames, rng)
         for clip in range(count):
             if KINDS[kind[clip]] == "kinect":
-                seen[clip], truth[clip] = self._real(rng)
+                observed[clip], truth[clip] = self._real(rng)
             else:
                 noise = self._noise(KINDS[kind[clip]], truth[clip], rng)
-                informative = rng.random() < 0.7  # whether the confidence goes with the noise
-                seen[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if informative else noise)
-        self._add_outliers(seen, kind, rng)
+                informative = rng.random() < 0.7  # whether the noise is inversely proportional to the confidence
+                observed[clip] = truth[clip] + (noise * (0.8 / confidence[clip, ..., None]) if informative else noise)
+        self._add_outliers(observed, kind, rng)
         # relative to the hips, as monocular networks give joints
         about = np.flatnonzero(rng.random(count) < np.where(kind == KINDS.index("monocular"), 0.8, 0.05))
-        for places in (seen, truth):
+        for places in (observed, truth):
             places[about] -= places[about][:, :, HIPS].mean(axis=2, keepdims=True)
         for clip in np.flatnonzero(rng.random(count) < TURNED):
-            _turn(seen[clip], truth[clip], rng)
-        return Sensed(seen, truth, confidence)
+            _turn(observed[clip], truth[clip], rng)
+        return Sensed(observed, truth, confidence)
 
     def _true(self, count: int, rng: Rng) -> Floats:
         start = self._motion.start
@@ -153,7 +153,7 @@ class Sensors:
             noise += rate * 10 ** rng.uniform(-3.0, -2.0) * rng.standard_normal((shape[0], 1, 1))
         if kind == "white" and rng.random() < 0.06:  # a camera of 15 frames a second, read at 30
             noise[1:-1:2] = 0.5 * (noise[:-2:2] + noise[2::2])
-        if rng.random() < 0.15:  # noise that swells and ebbs, of each joint or of the body
+        if rng.random() < 0.15:  # noise of varying size, of each joint or of the body
             noise *= np.exp(0.7 * _coloured((shape[0], rng.choice([1, 22]), 1), 0.98, rng))
         if rng.random() < 0.12:
             noise *= rng.choice([0.1, 1.0])
@@ -169,16 +169,16 @@ class Sensors:
         clip = rng.choice(len(self._pair_weight), p=self._pair_weight)
         first = start[clip] + int(rng.random() * max(start[clip + 1] - start[clip] - self._frames, 0))
         rows = slice(first, min(first + self._frames, start[clip + 1]))
-        seen, truth = np.full((2, self._frames, 22, 3), np.nan)
+        observed, truth = np.full((2, self._frames, 22, 3), np.nan)
         there = slice(rows.stop - rows.start)
-        seen[there], truth[there] = self._pairs.seen[rows], self._pairs.truth[rows]
+        observed[there], truth[there] = self._pairs.seen[rows], self._pairs.truth[rows]
         if rng.random() < 0.5:
-            seen, truth = (x[:, MIRROR] * (1.0, -1.0, 1.0) for x in (seen, truth))
-        return seen, truth
+            observed, truth = (x[:, MIRROR] * (1.0, -1.0, 1.0) for x in (observed, truth))
+        return observed, truth
 
-    def _add_outliers(self, seen: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
+    def _add_outliers(self, observed: Floats, kind: NDArray[np.int64], rng: Rng) -> None:
         """Outliers, exchanged limbs, lost frames and hidden joints, in place; of perfect sensors only the last two."""
-        count, frames = seen.shape[:2]
+        count, frames = observed.shape[:2]
         for clip in range(count):
             noisy = KINDS[kind[clip]] != "perfect"
             if noisy and rng.random() < 0.15:
@@ -186,29 +186,29 @@ class Sensors:
                 jump = rng.standard_normal((frames, 22, 3))
                 jump *= (rng.uniform(0.05, 0.4, (frames, 22)) / np.linalg.norm(jump, axis=-1))[..., None]
                 far = (np.linalg.norm(jump, axis=-1) > GATED) & (rng.random((frames, 22)) < 0.9)
-                seen[clip] += np.where(hit[..., None], jump, 0.0)
-                seen[clip][hit & far] = np.nan
+                observed[clip] += np.where(hit[..., None], jump, 0.0)
+                observed[clip][hit & far] = np.nan
             if noisy and rng.random() < 0.05:
                 first, length = rng.integers(1, frames - 1), rng.geometric(1 / 3)
                 pair = _LIMBS[rng.integers(len(_LIMBS))]
                 rows = slice(first, first + length)
                 if rng.random() < 0.5:
                     both = [*pair, *MIRROR[pair]]
-                    seen[clip, rows, both] = seen[clip, rows][:, MIRROR[both]].swapaxes(0, 1)
+                    observed[clip, rows, both] = observed[clip, rows][:, MIRROR[both]].swapaxes(0, 1)
                 else:
-                    seen[clip, rows, pair] = np.nan
+                    observed[clip, rows, pair] = np.nan
             if rng.random() < 0.08:
-                seen[clip, rng.random(frames) < 10 ** rng.uniform(-2.0, -0.5)] = np.nan
+                observed[clip, rng.random(frames) < 10 ** rng.uniform(-2.0, -0.5)] = np.nan
             if rng.random() < 0.08:  # joints that flicker
                 flickering = (rng.random(22) < rng.choice([0.3, 1.0])) * 10 ** rng.uniform(-1.3, -0.3)
-                seen[clip][rng.random((frames, 22)) < flickering] = np.nan
+                observed[clip][rng.random((frames, 22)) < flickering] = np.nan
         few = np.flatnonzero(rng.random(count) < 0.15)
-        seen[np.ix_(few, np.arange(frames), np.array(ABSENT))] = np.nan
+        observed[np.ix_(few, np.arange(frames), np.array(ABSENT))] = np.nan
         for clip in np.flatnonzero(rng.random(count) < 0.05):  # sensors of few joints
-            seen[clip][:, rng.random(22) < rng.uniform(0.2, 0.8)] = np.nan
+            observed[clip][:, rng.random(22) < rng.uniform(0.2, 0.8)] = np.nan
         hidden = np.flatnonzero(rng.random(count) < 0.2)
         if len(hidden):
-            seen[hidden] = occlude(seen[hidden], rng)
+            observed[hidden] = occlude(observed[hidden], rng)
 
 
 def sound(pairs: Pairs, threshold: float = 0.05) -> NDArray[np.bool_]:
@@ -289,7 +289,7 @@ def _carry(truth: Floats, rng: Rng) -> None:
         truth[rng.integers(1, len(truth)) :] += 0.2 * amplitude * rng.standard_normal(3)
 
 
-def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
+def _turn(observed: Floats, truth: Floats, rng: Rng) -> None:
     """Turn a clip about its first root by a random rotation or a tilt, in place.
 
     A third of the clips without unknown joints keep turning about their root, by up to one revolution per second.
@@ -300,7 +300,7 @@ def _turn(seen: Floats, truth: Floats, rng: Rng) -> None:
     if np.isfinite(truth).all() and rng.random() < 1 / 3:
         angle = np.arange(len(truth)) / FPS * rng.uniform(0.0, 2 * np.pi)
         turns, pivot = turns * Rotation.from_rotvec(angle[:, None] * axis), truth[:, :1].copy()
-    for places in (seen, truth):
+    for places in (observed, truth):
         places[:] = np.einsum("...ab,...jb->...ja", turns.as_matrix(), places - pivot) + pivot
 
 

@@ -81,8 +81,8 @@ class CompletionNet(nn.Module):
     features are the whole body, so a knee follows from hip, ankle and the other leg.
 
     The interpolation of a resting limb relative to its parent (`prior.models.hgvae.features`) is accurate to the
-    millimetre, which no network is. So the network's correction is fused with it by inverse variances. The
-    interpolation's grows with the time from an observation, and with how much the joint moved while it was observed.
+    millimetre, and the network is not. The network's correction is therefore fused with it by inverse variances. The
+    variance of the interpolation increases with the time from an observation, and with the joint's mobility.
     """
 
     def __init__(self, frames: int, config: CompletionConfig) -> None:
@@ -154,9 +154,9 @@ def _by_track(nodes: Tensor, tracks: int) -> Tensor:
 class FaultNet(nn.Module):
     """Predicts the log odds that a joint's error is larger than the sensor's noise explains.
 
-    A window's likelihood under a generative model does not tell a frozen hand from a resting one, and takes a dance for
-    a fault. The most powerful test is the likelihood ratio (Neyman and Pearson), which a classifier learns. This one
-    reads the observations and HG-VAE's reconstruction with its deviation; `training.recipes.hgvae_faults` trains it.
+    A window's likelihood under a generative model does not distinguish a frozen hand from a resting one, and is low for
+    a dance too. The most powerful test is the likelihood ratio (Neyman and Pearson), which a classifier learns. This
+    one reads the observations and HG-VAE's reconstruction with its deviation (`training.recipes.hgvae_faults`).
     """
 
     def __init__(self, config: FaultNetConfig) -> None:

@@ -107,7 +107,7 @@ class MixtureNet(nn.Module):
     def forward(self, features: Tensor, present: Tensor) -> Tensor:
         """Return outputs (C, T, 22, OUTPUTS) from features (C, T, 22, FEATURES) of whole clips.
 
-        ``present`` (C, T) says whether there is a body.
+        ``present`` (C, T) is whether there is a body.
         """
         normalised = (features - self.mean) / self.deviation
         own = F.relu(self.read(normalised) + self.joint)

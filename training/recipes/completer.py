@@ -94,7 +94,7 @@ GAPS, CONTEXT = (3, 64), (2, 30)
 SCALES = (0.85, 1.15)  # range of factors on people's sizes
 
 TRAINED_SHARE = 20.0
-"""`SHARE_FRAMES` in training. Inference takes a smaller share, because other people's motion is predicted less well."""
+"""`SHARE_FRAMES` in training. Inference uses a smaller share: the error for people unlike training is larger."""
 
 NOISY, NOISE = 0.3, 0.015
 """Share of windows with noisy known joints, and largest standard deviation of the noise along an axis, metres."""
@@ -157,7 +157,7 @@ class Truth:
         rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
         if rng is not None:
             half = len(rows) // 2
-            # across the world's xz plane, which is as good as any
+            # across the world's xz plane; any vertical plane would do
             flip = torch.tensor([1.0, -1.0, 1.0])
             rotations = torch.cat([mirror_rotations(rotations[:half]), rotations[half:]])
             root = torch.cat([root[:half] * flip, root[half:]])
@@ -166,7 +166,7 @@ class Truth:
             root, offsets = root * scale, offsets * scale
         return cls(rotations, root, offsets)
 
-    def seen(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
+    def window_of(self, known: Bools, usual: Tensor, rng: Rng | None = None) -> Window:
         """Return the completer's input if these joints (B, T, 22) are known; with ``rng``, some are noisy."""
         joints = forward_kinematics(self.rotations, self.offsets[:, None], self.root)[0].double().numpy()
         if rng is not None:
@@ -247,7 +247,7 @@ def predict(model: Completer, window: Window) -> tuple[Tensor, Tensor]:
 
 def loss(model: Completer, truth: Truth, known: Bools, rng: Rng) -> tuple[Tensor, dict[str, float]]:
     """Return the absolute errors where joints are hidden, normalised by window (`EASY`), and the terms by name."""
-    window = truth.seen(known, model.usual, rng)
+    window = truth.window_of(known, model.usual, rng)
     rotations, root = predict(model, window)
     true, true_root = truth.in_frame_of(window)
     joints, turned = forward_kinematics(torch.stack([rotations, true]), truth.offsets[:, None])
@@ -281,7 +281,7 @@ PROTOCOL = (10, 1)
 @torch.no_grad()
 def evaluate_completer(model: Completer, motion: MotionSet, windows: int = 192) -> dict[str, float]:
     """Errors on unseen people: ``val 15 of line`` in gaps of 15 frames (and 30), as a share of slerp's and lerp's;
-    ``val legs mm`` of knees, ankles and feet never seen."""
+    ``val legs mm`` of knees, ankles and feet never observed."""
     found = {}
     for gap in (15, 30):
         frames = sum(PROTOCOL) + gap
@@ -322,9 +322,9 @@ def calibrate(model: Completer, motion: MotionSet, windows: int = 100) -> Comple
         mine, hidden = slice(len(between), len(between) + gap), slice(before, before + gap)
         between = np.append(between, 1.0 / (1.0 / since + 1.0 / since[::-1]))
         for part in (*HIDDEN_PARTS, [J["pelvis"]], [J["spine3"]]):
-            seen = truth.copy()
-            seen[:, hidden, part] = np.nan
-            done = np.stack([complete(fill, *window).positions for window in zip(seen, offsets, strict=True)])
+            observed = truth.copy()
+            observed[:, hidden, part] = np.nan
+            done = np.stack([complete(fill, *window).positions for window in zip(observed, offsets, strict=True)])
             found = np.sqrt(np.square(done - truth)[:, hidden].mean(axis=(0, 3)))
             off[mine, part] = np.where(np.isnan(off[mine, part]), found[:, part], off[mine, part])
     fits: list[tuple[float, Floats, float]] = []
@@ -340,7 +340,7 @@ def _errors(model: Completer, motion: MotionSet, known: Bools, windows: int) -> 
     """(T, 22) mean distances of joints from the truth, metres, of prediction and line."""
     rows = _spread(motion.all_windows(len(known), step=5), windows)
     truth = Truth.of(motion, rows)
-    window = truth.seen(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
+    window = truth.window_of(np.broadcast_to(known, (windows, *known.shape)).copy(), model.usual)
     rotations, root = truth.in_frame_of(window)
     aim, _ = forward_kinematics(rotations, truth.offsets[:, None], root)
 

@@ -40,7 +40,7 @@ OUTPUTS = 2 * len(CONTACT_JOINTS)  # number of outputs: load of each joint, then
 
 @dataclass(frozen=True)
 class ContactConfig:
-    hidden: int = 64  # numbers that the network remembers of a body
+    hidden: int = 64  # size of a body's hidden state
 
 
 class ContactNet(nn.Module):
@@ -71,7 +71,7 @@ SOLE_SD = 0.01
 
 YAW_SD = math.radians(15.0)  # standard deviation of the heading's error, radians
 
-ROOT_UNSEEN, GROUND_UNKNOWN, FEET_ALONE = 0.25, 0.25, 0.15
+ROOT_UNOBSERVED, GROUND_UNKNOWN, FEET_ALONE = 0.25, 0.25, 0.15
 """Shares of windows with joints relative to the root only, with unknown ground, and with only the feet known."""
 
 _HANDS_KNEES_ROOT = [0, *(J[f"{side}_{part}"] for side in ("left", "right") for part in ("knee", "wrist"))]
@@ -113,8 +113,8 @@ def _smoothed(motion: MotionSet, first: NDArray[np.int64], rng: Rng) -> tuple[ND
     yaw[mirrored] *= -1.0
     truth *= rng.uniform(*SCALES, (len(rows), 1, 1, 1))
     delay = int(rng.choice(DELAYS))
-    smoother, seen = MixtureSmoother(delay, len(rows)), truth + _errors(truth.shape, rng)
-    estimates = [smoother.update(seen[:, t], t / FPS) for t in range(FRAMES)]
+    smoother, observed = MixtureSmoother(delay, len(rows)), truth + _errors(truth.shape, rng)
+    estimates = [smoother.update(observed[:, t], t / FPS) for t in range(FRAMES)]
     kept = [estimate for estimate in estimates if estimate is not None]
     positions, sigma = np.full(truth.shape, np.nan), np.full(truth.shape[:3], np.nan)
     positions[:, : len(kept)] = np.stack([estimate.positions for estimate in kept], axis=1)
@@ -143,7 +143,7 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
     alone = rng.random(count) < FEET_ALONE
     positions[np.ix_(alone, np.arange(frames), _HANDS_KNEES_ROOT)] = np.nan
     positions[..., 2] += rng.normal(0.0, SOLE_SD, (count, 1, 1)) + rng.normal(0.0, SOLE_SD / 2, (count, 1, 22))
-    root_observed = (alone | (rng.random(count) >= ROOT_UNSEEN)).astype(float)
+    root_observed = (alone | (rng.random(count) >= ROOT_UNOBSERVED)).astype(float)
     known = rng.random(count) >= GROUND_UNKNOWN
     ground = np.where(known[:, None], np.zeros((count, len(CONTACT_JOINTS))), np.nan)
     yaw = pool.yaw[clips] + np.where(alone, rng.uniform(-np.pi, np.pi, count), rng.normal(0.0, YAW_SD, count))[:, None]
@@ -163,11 +163,7 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
     counts = np.repeat(counts, load.shape[-1], axis=-1)
     counts[alone, :, : _FEET.start] = counts[alone, :, _FEET.stop :] = False
     inputs = torch.from_numpy(np.nan_to_num(features)).reshape(count, frames - 1, FEATURES)
-    return inputs, _tensor(load), _tensor(rest), _tensor(counts)
-
-
-def _tensor(values: NDArray[Any]) -> Tensor:
-    return torch.from_numpy(values.astype(np.float32))
+    return inputs, *(torch.from_numpy(values).float() for values in (load, rest, counts))
 
 
 def train_contacts(options: TrainingOptions) -> Path:
@@ -202,8 +198,8 @@ def evaluate_contacts(model: ContactNet, pool: Pool) -> dict[str, float]:
     """F1 of the feet, of load and of rest, over all clips."""
     features, *labels, counts = draw(pool, np.arange(len(pool.yaw)), np.random.default_rng(0))
     counted = counts[..., _FEET] > 0
-    found = {}
+    scores = {}
     for name, logits, label in zip(("load", "rest"), model(features), labels, strict=True):
         yes, true = logits[..., _FEET][counted] > 0, label[..., _FEET][counted] > 0.5
-        found[f"val {name} F1"] = float(2 * (yes & true).sum() / (yes.sum() + true.sum()))
-    return found
+        scores[f"val {name} F1"] = float(2 * (yes & true).sum() / (yes.sum() + true.sum()))
+    return scores

@@ -77,8 +77,8 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
         builds.append(vary_builds(clean[-quarter:], 1.4 * BONE_SIGMA, 2 * TURN_SIGMA, rng))
         clean = np.concatenate(builds)
         bias_sigma = draw_bias_sigma(count, rng)
-        seen = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, FAULT_SHARE, rng), rng)
-        off, log_var, hidden = _errors(model, seen, clean, sizes, bias_sigma)
+        observed = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, FAULT_SHARE, rng), rng)
+        off, log_var, hidden = _errors(model, observed, clean, sizes, bias_sigma)
         density = 0.5 * (log_var + off.square() * (-log_var).exp())
         loss = (density * (0.5 * log_var.detach()).exp())[hidden].mean()
         return loss, {"loss": loss.item()}
@@ -89,10 +89,12 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
     )  # fmt: skip
 
 
-def _errors(model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, bias_sigma: Floats | float) -> tuple[Tensor, ...]:
+def _errors(
+    model: HGVAE, noisy: Floats, truth: Floats, sizes: Floats, bias_sigma: Floats | float
+) -> tuple[Tensor, ...]:
     """Return errors (B, 66, T) of completed windows (B, T, 22, 3), their predicted log-variance, both in units of
     `SCALE`, and which entries were hidden since the body's first observation."""
-    batch = Batch.of(model, seen, truth, sizes)
+    batch = Batch.of(model, noisy, truth, sizes)
     completed, log_var = _network(model).complete(batch.x, batch.observed, bias_sigma)
     off = completed - batch.target
     return off, log_var.repeat_interleave(3, dim=1), (batch.observed == 0) & (batch.counts > 0)
@@ -106,20 +108,20 @@ def _network(model: HGVAE) -> CompletionNet:
 @torch.no_grad()
 def evaluate_completion(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
     """Evaluate on unseen people: RMS error along an axis of joints hidden as in training, and of 1 and 4 hidden joints.
-    Returns ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``found/stated``, the error-to-sigma ratio of the
+    Returns ``hidden mm``, ``1 joints mm``, ``4 joints mm``; and ``error/sigma``, the error-to-sigma ratio of the
     first."""
     rng = np.random.default_rng(1)
     clean, sizes = val.draw(windows, model.config.frames, rng)
     bias_sigma = draw_bias_sigma(windows, rng)
     off, log_var, hidden = _errors(model, occlude(add_noise(clean, rng, bias_sigma), rng), clean, sizes, bias_sigma)
-    found = {"hidden mm": _rms_mm(off[hidden]), "found/stated": (off * (-0.5 * log_var).exp())[hidden].std().item()}
+    scores = {"hidden mm": _rms_mm(off[hidden]), "error/sigma": (off * (-0.5 * log_var).exp())[hidden].std().item()}
     for count in (1, 4):
-        seen = clean.copy()
-        for window in seen:
+        observed = clean.copy()
+        for window in observed:
             window[:, 1 + rng.choice(21, count, replace=False)] = np.nan
-        off, _, hidden = _errors(model, seen, clean, sizes, 0.0)
-        found[f"{count} joints mm"] = _rms_mm(off[hidden])
-    return found
+        off, _, hidden = _errors(model, observed, clean, sizes, 0.0)
+        scores[f"{count} joints mm"] = _rms_mm(off[hidden])
+    return scores
 
 
 def _rms_mm(off: Tensor) -> float:
@@ -198,7 +200,7 @@ def train_completion(options: TrainingOptions) -> Path:
 
 
 def recipe_of(train: Windows, val: Windows, rate: float) -> Recipe[HGVAE]:
-    """Of all of a model but its completion network, with the loss of the module's docstring."""
+    """Return the recipe of a model without its completion network, with the loss of the module's docstring."""
 
     def loss_of(model: HGVAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         positions, sizes = train.draw(count, model.config.frames, rng, STRIDES)
@@ -206,13 +208,13 @@ def recipe_of(train: Windows, val: Windows, rate: float) -> Recipe[HGVAE]:
         whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
         bias_sigma = draw_bias_sigma(count - half, rng)
         clean = vary_builds(positions[half:], BONE_SIGMA, TURN_SIGMA, rng)
-        seen = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, 0.5, rng), rng)
-        both = whole.joined(Batch.of(model, seen, clean, sizes[half:]).completed(model, bias_sigma))
+        observed = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, 0.5, rng), rng)
+        both = whole.joined(Batch.of(model, observed, clean, sizes[half:]).completed(model, bias_sigma))
         drawn = model(both.x, both.certainty, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
-        stated = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
+        sigma = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
         # weighted by the predicted deviation, see `completion_recipe`
-        density[half:] = density[half:] * (stated / stated.mean())
+        density[half:] = density[half:] * (sigma / sigma.mean())
         likelihood = density.flatten(1).sum(dim=1)
         kl = drawn.kl[:half].sum() / count
         beta = min(KL_START + (1 - KL_START) * done / WARM_UP, 1.0)
@@ -236,7 +238,7 @@ def evidence(drawn: HGVAEOutput, target: Tensor) -> tuple[Tensor, Tensor]:
 def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, float]:
     """Evaluate on unseen people: evidence lower bound, reconstruction error, and error of completed entries. Returns
     ``ELBO`` and its ``log p(x|z)``, nats per entry; ``val mm``, the mean joint error of whole windows; ``hidden mm``,
-    that of joints hidden as in training; ``guess mm``, that of the completion network alone; ``hidden found/stated``,
+    that of joints hidden as in training; ``guess mm``, that of the completion network alone; ``hidden error/sigma``,
     the error-to-sigma ratio of the hidden joints."""
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)
@@ -256,7 +258,7 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
         "val mm": _joint_error(whole_output.tracks.mean, whole.target).mean().item(),
         "hidden mm": _joint_error(completed.tracks.mean, partial.target)[hidden].mean().item(),
         "guess mm": _joint_error(partial.x, partial.target)[hidden].mean().item(),
-        "hidden found/stated": z.unflatten(1, (-1, 3)).mean(dim=2)[hidden].mean().sqrt().item(),
+        "hidden error/sigma": z.unflatten(1, (-1, 3)).mean(dim=2)[hidden].mean().sqrt().item(),
     }
 
 

@@ -121,19 +121,19 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rn
     faulty = with_faults(clean, FAULTS, FAULT_SHARE, rng)
     fast = rng.uniform(0.0, 1.0, count) * (rng.random(count) < 0.8)  # some sensors smooth their output
     noisy = with_drifting_error(faulty, sigma, rng, fast)
-    seen = with_faults(noisy, (repeats,), REPEATED, rng)
-    astray = np.sqrt(((faulty - clean + seen - noisy)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
-    repeated = (seen != noisy)[:, -RECENT:].any(axis=-1).mean(axis=1)
+    observed = with_faults(noisy, (repeats,), REPEATED, rng)
+    astray = np.sqrt(((faulty - clean + observed - noisy)[:, -RECENT:] ** 2).mean(axis=(1, 3)))
+    repeated = (observed != noisy)[:, -RECENT:].any(axis=-1).mean(axis=1)
     lost = (repeated > 0.5) & (sigma * np.sqrt(fast) > MIN_NOISE)[:, None]
     lacking = rng.random(count)
     for k in np.flatnonzero(lacking < 0.7):
-        alone, few = seen[k : k + 1], lacking[k] < 0.4
+        alone, few = observed[k : k + 1], lacking[k] < 0.4
         alone[:] = hide_joints(alone, int(rng.integers(1, MISSING[-1])), rng) if few else occlude(alone, rng)
     limit = np.maximum(MIN_FAULT, sigma)[:, None]
-    shown = np.isfinite(seen[:, -RECENT:, :, 0]).any(axis=1)
+    shown = np.isfinite(observed[:, -RECENT:, :, 0]).any(axis=1)
     off = (astray > limit) | lost
     clear = torch.from_numpy(shown & (off | (astray < 0.2 * limit) & (repeated == 0))).float()
-    reconstructed = _reconstruct(model, seen, sizes, sigma * np.sqrt(1.0 - fast))
+    reconstructed = _reconstruct(model, observed, sizes, sigma * np.sqrt(1.0 - fast))
     logits = network(torch.from_numpy(fault_features(*reconstructed, sigma, network.mean.numpy())))
     labels = torch.from_numpy(off).float()
     return (F.binary_cross_entropy_with_logits(logits, labels, reduction="none") * clear).sum() / clear.sum()
@@ -141,17 +141,17 @@ def _loss(network: FaultNet, model: HGVAE, windows: Windows, count: int, rng: Rn
 
 @torch.no_grad()
 def _reconstruct(
-    model: HGVAE, seen: Floats, sizes: Floats, bias_sigma: Floats | float
+    model: HGVAE, windows: Floats, sizes: Floats, bias_sigma: Floats | float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Reconstruct windows (B, T, 22, 3) of bodies of sizes (B,), given the sensor's bias ``bias_sigma`` (B,) metres.
 
     Returns the tracks, HG-VAE's mean and standard deviation, all (B, 66, T) metres, and the observed mask.
     """
-    tracks = to_tracks(seen, sizes)
+    tracks = to_tracks(windows, sizes)
     observed = torch.from_numpy(tracks.observed).float()
-    found = model(*model.completed(standardise(model, tracks.x), observed, bias_sigma)).tracks
-    mean = found.mean.double() * SCALE + model.mean[:, None]
-    return tracks.x, mean.numpy(), (0.5 * found.log_var.double()).exp().numpy() * SCALE, tracks.observed
+    decoded = model(*model.completed(standardise(model, tracks.x), observed, bias_sigma)).tracks
+    mean = decoded.mean.double() * SCALE + model.mean[:, None]
+    return tracks.x, mean.numpy(), (0.5 * decoded.log_var.double()).exp().numpy() * SCALE, tracks.observed
 
 
 class Scored(NamedTuple):
@@ -162,14 +162,14 @@ class Scored(NamedTuple):
 
 
 @torch.inference_mode()
-def score_windows(network: FaultNet, model: HGVAE, seen: Floats, sizes: Floats, sensor_sigma: float) -> Scored:
+def score_windows(network: FaultNet, model: HGVAE, observed: Floats, sizes: Floats, sensor_sigma: float) -> Scored:
     """Score windows (B, T, 22, 3) of bodies of sizes (B,), by a sensor of ``sensor_sigma`` metres along an axis."""
     bias_sigma, mean, parts = sensor_sigma * np.sqrt(1.0 - JITTER_SHARE), network.mean.numpy(), []
-    for start in range(0, len(seen), 256):
+    for start in range(0, len(observed), 256):
         some = slice(start, start + 256)
-        reconstructed = _reconstruct(model, seen[some], sizes[some], bias_sigma)
+        reconstructed = _reconstruct(model, observed[some], sizes[some], bias_sigma)
         odds = network(torch.from_numpy(fault_features(*reconstructed, sensor_sigma, mean)))
-        joints = joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(seen[some]))
+        joints = joint_odds(odds.double().numpy(), reconstructed[-1], frozen_joints(observed[some]))
         parts.append(Scored(joints, pace(reconstructed[1])))
     return Scored(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
@@ -182,10 +182,10 @@ def calibrate(network: FaultNet, model: HGVAE, windows: Windows, count: int, see
     for m, s in track(conditions, "calibrating"):
         positions, sizes = _at_paces(windows, model.config.frames, count, rng)
         sigma, fast = np.full(len(positions), SENSOR_SIGMAS[s]), rng.uniform(0.0, 1.0, len(positions))
-        seen = hide_joints(with_drifting_error(positions, sigma, rng, fast), MISSING[m], rng)
-        found = score_windows(network, model, seen, sizes, SENSOR_SIGMAS[s])
-        of_class = np.digitize(found.pace, PACE_EDGES)
-        odds = found.odds.max(axis=1)
+        observed = hide_joints(with_drifting_error(positions, sigma, rng, fast), MISSING[m], rng)
+        scored = score_windows(network, model, observed, sizes, SENSOR_SIGMAS[s])
+        of_class = np.digitize(scored.pace, PACE_EDGES)
+        odds = scored.odds.max(axis=1)
         for p in range(len(PACES)):
             own = odds[of_class == p]
             quantiles[m, s, p] = np.quantile(own if len(own) else odds, 1 - np.array(RATES))

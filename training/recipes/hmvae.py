@@ -98,8 +98,8 @@ def recipe_of(name: str, config: HMVAEConfig, train: MotionSet, val: MotionSet, 
         rows = windows.sample(count, model.window, used.strides, rng)
         rotations, offsets = _augment(train.rotations[rows], train.offsets[rows[:, 0]])
         rotations, _ = remove_heading(rotations, model.window // 2 - 1)
-        seen = corrupt(rotations, offsets, rng)
-        return _loss(model, seen, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, used.joint_weight)
+        noisy = corrupt(rotations, offsets, rng)
+        return _loss(model, noisy, rotations, offsets, (done - GLOBAL_FIRST) / LOCAL_WARM_UP, used.joint_weight)
 
     def falls_twice(optimiser: Optimizer, steps: int) -> LRScheduler:
         return MultiStepLR(optimiser, [int(steps * share) for share in (0.6, 0.85)], gamma=0.3)
@@ -148,11 +148,11 @@ def corrupt(rotations: Tensor, offsets: Tensor, rng: Rng, noise: float | None = 
 
 
 def _loss(
-    model: HMVAE, seen: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, joint_weight: float
+    model: HMVAE, noisy: Tensor, rotations: Tensor, offsets: Tensor, local_weight: float, joint_weight: float
 ) -> tuple[Tensor, dict[str, float]]:
     """Equations 3 and 5 to 8, each term a mean. ``local_weight`` is z_l's share of beta; below 0, z_l is detached."""
     x = to_6d(rotations)
-    given = to_6d(seen)
+    given = to_6d(noisy)
     posterior = model.encode(given)
     local, deep = posterior.sample()
     local_kl, global_kl = posterior.kl()

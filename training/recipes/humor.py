@@ -30,8 +30,8 @@ of the training over which it grows from 0."""
 JOINTS_WEIGHT, ROTATIONS_WEIGHT = 100.0, 10.0
 """Weights of squared joint errors (m²) and of squared entries of rotation matrices, relative to the weight 1 of
 velocities ((m/s)²). The paper's decoder predicts velocities separately; here they are differences, 30 times a joint's
-error. With the paper's weights of 1, a rollout would take half a minute to recover from an error; with these, it takes
-a third of a second."""
+error. With the paper's weights of 1, an error of a rollout decays within half a minute; with these, within a third of a
+second."""
 
 CONTACT_WEIGHT, STILL_WEIGHT = 0.01, 0.01
 """Weights of the contacts' cross-entropy, and of the squared velocity of resting joints."""

@@ -57,7 +57,7 @@ AVERAGE = 0.999  # decay of the exponential moving average of the weights, which
 
 
 class Batch(NamedTuple):
-    """Clips (C, T, ...): arguments of `answer`, ground truth, and weights ``counts`` of the position errors."""
+    """Clips (C, T, ...): arguments of `estimate`, ground truth, and weights ``counts`` of the position errors."""
 
     features: Tensor
     experts: Tensor
@@ -72,7 +72,7 @@ class Batch(NamedTuple):
 
 def through_bank(sensed: Sensed, delay: int) -> Batch:
     """Compute the live node's features of clips, without the last ``delay`` frames."""
-    clips, frames = sensed.seen.shape[:2]
+    clips, frames = sensed.observed.shape[:2]
     kept = frames - delay
     features = np.empty((kept, clips, 22, FEATURES), dtype=np.float32)
     experts = np.empty((kept, clips, 22, EXPERTS, 3))
@@ -80,8 +80,9 @@ def through_bank(sensed: Sensed, delay: int) -> Batch:
     gap, between = np.empty((2, kept, clips, 22))
     bank, whiteness, covariance = new_bank(clips, delay), Whiteness(clips, delay), body_covariance()
     for t in range(frames):
-        advance(bank, t, 1 / FPS, sensed.seen[:, t], sensed.confidence[:, t], DENSITIES, MEASUREMENT_SIGMA, covariance)
-        at, white = t - delay, whiteness.share(sensed.seen[:, t])
+        frame, confidence = sensed.observed[:, t], sensed.confidence[:, t]
+        advance(bank, t, 1 / FPS, frame, confidence, DENSITIES, MEASUREMENT_SIGMA, covariance)
+        at, white = t - delay, whiteness.share(frame)
         if at >= 0:
             describe(bank, t + 1, delay, PARENT, white, experts[at], features[at], scale[at], gap[at], between[at])
             heading[at], share[at] = bank.heading, fallback(white, scale[at], delay)
@@ -115,8 +116,8 @@ def errors(places: Tensor, truth: Tensor, weight: Tensor, counts: Tensor) -> Err
     """
     off = torch.where(weight[..., None] > 0, places - truth, 0.0) * 1e3
     bent = off[:, 2:] - 2 * off[:, 1:-1] + off[:, :-2]
-    seen = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
-    counted, smooth = weight * counts, seen / counts[:, 1:-1].sqrt()
+    observed = (weight[:, 2:] >= 1) & (weight[:, 1:-1] >= 1) & (weight[:, :-2] >= 1)
+    counted, smooth = weight * counts, observed / counts[:, 1:-1].sqrt()
     return Errors(
         (counted * _length(off)).sum(dim=(1, 2)) / counted.sum(dim=(1, 2)).clamp(min=1),
         (smooth * _length(bent)).sum(dim=(1, 2)) / smooth.sum(dim=(1, 2)).clamp(min=1),
@@ -135,10 +136,10 @@ def loss_of(network: MixtureNet, batch: Batch, delay: int) -> tuple[Tensor, Tens
     experts = torch.where(known[..., None, None], batch.experts, 0.0)
     places, variance = estimate(outputs, experts, batch.heading, batch.scale, batch.gap, batch.between, batch.fallback)
     weight = known / (1.0 + batch.gap.clamp(min=0))  # nothing can be learned far from any observation
-    seen = known * (batch.gap == 0).float()
+    observed = known * (batch.gap == 0).float()
     own = errors(places, batch.truth, weight, batch.counts)
     with torch.no_grad():
-        each = [errors(experts[:, :, :, m], batch.truth, seen, batch.counts) for m in range(EXPERTS)]
+        each = [errors(experts[:, :, :, m], batch.truth, observed, batch.counts) for m in range(EXPERTS)]
         position, acceleration = (torch.stack(values) for values in zip(*each, strict=True))
         nearest, best = position.amin(dim=0), (position + acceleration).argmin(dim=0, keepdim=True)
         position, acceleration = position.gather(0, best)[0], acceleration.gather(0, best)[0]

@@ -44,7 +44,7 @@ FRAMES, CLIPS = 120, 64  # length of a clip, frames, and number of clips that ar
 RECORDED = {"train": 16, "val": 4}  # number of pipeline runs for each split
 ROWS = 60_000  # largest number of occluded joints kept from a run
 RADII = 0.12, 0.2  # range of radii of a trunk that hides arms, metres
-SEEN_FIRST = 8, 40  # range of the time before joints are hidden, in clips that lose the lower part or one side, frames
+FIRST_HIDDEN = 8, 40  # range of the first hidden frame in clips that lose the lower part or one side
 
 DELAYS = (0, 0, 2, 4, 4, 8, 16)
 
@@ -132,7 +132,7 @@ def occlusions(truth: Floats, rng: Rng) -> Bools:
                 middle = across[:, :1] if rng.random() < 0.5 else across[:, 0].mean()
                 gone = across > middle + rng.uniform(-0.1, 0.25)
             hidden[:, clip] = gone
-            hidden[: int(rng.integers(*SEEN_FIRST)), clip] = False
+            hidden[: int(rng.integers(*FIRST_HIDDEN)), clip] = False
             continue
         at = int(rng.integers(10, 40))
         while at < frames:
@@ -169,18 +169,18 @@ class _Recorder:
 
 def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, split: str) -> Rows:
     """Record the pipeline's occluded joints over ``runs`` runs of `CLIPS` clips."""
-    found: list[tuple[Any, ...]] = []
+    recorded: list[tuple[Any, ...]] = []
     for run in track(range(runs), description=f"occlusions, {split}"):
         rng = np.random.default_rng((seed, run, split == "val"))
         sensed, delay = sensors.draw(CLIPS, rng), int(rng.choice(DELAYS))
         truth = sensed.truth.swapaxes(0, 1)
-        seen = np.where(occlusions(truth, rng)[..., None], np.nan, sensed.seen.swapaxes(0, 1))
+        observed = np.where(occlusions(truth, rng)[..., None], np.nan, sensed.observed.swapaxes(0, 1))
         recorder = _Recorder()
         core = CleanCore(replace(settings, delay=delay, max_bodies=CLIPS), Counter())
         assert core.fuse.occluded
         core.fuse.occluded.weigher = recorder
         present = np.ones(CLIPS, dtype=bool)
-        for t, (frame, confidence) in enumerate(zip(seen, sensed.confidence.swapaxes(0, 1), strict=True)):
+        for t, (frame, confidence) in enumerate(zip(observed, sensed.confidence.swapaxes(0, 1), strict=True)):
             recorder.frame = t - delay
             confidence = np.where(np.isfinite(frame[..., 0]), confidence, 0.0)
             core.step(Observation(t / FPS, frame, confidence, present, np.zeros(3), np.zeros((CLIPS, 22))))
@@ -192,8 +192,8 @@ def record(sensors: Sensors, settings: PriorSettings, runs: int, seed: int, spli
         off = truth[at, body, joint] - first[:, 0]
         known = np.flatnonzero(np.isfinite(off[:, 0]))
         kept = rng.choice(known, min(len(known), ROWS), replace=False)
-        found.append((features[kept], joint[kept], (candidates - first)[kept], off[kept]))
-    features, joint, candidates, off = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        recorded.append((features[kept], joint[kept], (candidates - first)[kept], off[kept]))
+    features, joint, candidates, off = (np.concatenate(parts) for parts in zip(*recorded, strict=True))
     return Rows(features, joint.astype(np.int64), candidates.astype(np.float32), off.astype(np.float32))
 
 
@@ -243,7 +243,7 @@ def train_occlusion(options: TrainingOptions) -> Path:
 
 
 def _rows(arrays: Path, split: str, seed: int) -> Rows:
-    """Return the rows of a split, recorded once. A recorder replaces the network, so any weights will do."""
+    """Return the rows of a split, recorded once, independently of the network's weights, as a recorder replaces it."""
 
     def make() -> dict[str, NDArray[Any]]:
         return vars(record(Sensors.of(arrays, split, FRAMES), PriorSettings(), RECORDED[split], seed, split))

@@ -1,7 +1,7 @@
 """The trajectory network and its training: root velocity from the body's own motion (HM-VAE, section 3.3).
 
 The paper convolves joint positions over the skeleton and time. Here, a recurrent network reads each frame's positions
-and velocities, turned to the body's heading; the official code lets the network learn this. It sees no future frames,
+and velocities, turned to the body's heading; the official code lets the network learn this. It reads no future frames,
 so it adds no delay. It also predicts the velocity's standard deviation and, in training only, HuMoR's eight contacts.
 """
 

@@ -197,7 +197,7 @@ def test_training_ends_the_same_twice(tmp_path: Path, monkeypatch: pytest.Monkey
     assert one == other
     motion = MotionSet.load(data, "default", "train")
     truth = Truth.of(motion, motion.all_windows(12, 40)[:2])
-    assert np.isfinite(truth.seen(np.ones((2, 12, 22), bool), torch.from_numpy(USUAL)).features).all()
+    assert np.isfinite(truth.window_of(np.ones((2, 12, 22), bool), torch.from_numpy(USUAL)).features).all()
 
 
 def test_calibration_finds_the_errors_and_how_soon_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
