@@ -163,7 +163,7 @@ def draw(pool: Pool, clips: NDArray[np.int64], rng: Rng) -> tuple[Tensor, Tensor
     counts = np.repeat(counts, load.shape[-1], axis=-1)
     counts[alone, :, : _FEET.start] = counts[alone, :, _FEET.stop :] = False
     inputs = torch.from_numpy(np.nan_to_num(features)).reshape(count, frames - 1, FEATURES)
-    return inputs, *(torch.from_numpy(values).float() for values in (load, rest, counts))
+    return inputs, torch.from_numpy(load).float(), torch.from_numpy(rest).float(), torch.from_numpy(counts).float()
 
 
 def train_contacts(options: TrainingOptions) -> Path:
