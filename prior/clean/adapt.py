@@ -101,10 +101,7 @@ def _canonical(body: RawBody, layout: Skeleton, counters: Counter[str]) -> tuple
 
 
 def _size_of(positions: Floats) -> float:
-    """Return the median ratio of the bone lengths of joints (22, 3) to the mean person's; 1 if too few are observed.
-
-    One frame of another size would spoil running estimates for seconds.
-    """
+    """Return the median ratio of the bone lengths of joints (22, 3) to the mean person's; 1 if too few are observed."""
     lengths = np.linalg.norm(positions[1:] - positions[PARENT[1:]], axis=1)
     observed = np.isfinite(lengths)
     return median(lengths[observed] / REST_LENGTHS[1:][observed]) if observed.sum() >= MIN_BONES else 1.0

@@ -16,6 +16,8 @@ MAX_DISTANCE = 30.0
 """Largest distance of a joint from the sensor, metres; joints farther away count as missing."""
 MAX_PLACE = 10_000.0
 """Largest coordinate of a sensor's position, metres; beyond it, float32 joints would lose millimetres."""
+BACKWARDS_NS = 1_000_000_000
+"""Least step back in time that starts a new stream, nanoseconds; a smaller one is a frame out of order."""
 ACCEPT_AFTER = 3
 """Number of consecutive messages with increasing stamps after which a jump of stamps is accepted: the source paused, or
 its clock was set."""
@@ -40,12 +42,11 @@ class StampGate:
 
     Args:
         timeout_ns: longest time between two stamps of a stream, unless the whole stream is slower.
-        back_ns: by how much a stamp may be out of order.
         counters: counts ``stamp_outlier``.
     """
 
-    def __init__(self, timeout_ns: float, back_ns: int, counters: Counter[str]) -> None:
-        self._timeout_ns, self._back_ns, self._counters = timeout_ns, back_ns, counters
+    def __init__(self, timeout_ns: float, counters: Counter[str]) -> None:
+        self._timeout_ns, self._counters = timeout_ns, counters
         self._last_ns: int | None = None
         self._step_ns = 0  # between the last two admitted stamps
         self._held: list[tuple[PoseRaw, int]] = []
@@ -59,7 +60,7 @@ class StampGate:
         if raw.end_of_stream:
             return [*self.release(), (raw, at_ns)]
         longest_ns = SLOWEST_NS if gap else max(self._timeout_ns, 2 * self._step_ns)
-        if self._last_ns is None or -self._back_ns < raw.stamp_ns - self._last_ns <= longest_ns:
+        if self._last_ns is None or -BACKWARDS_NS < raw.stamp_ns - self._last_ns <= longest_ns:
             self._drop()
             self._note(raw.stamp_ns)
             return [(raw, at_ns)]

@@ -29,10 +29,10 @@ from steadypose.prior.clean.adapt import (
     end_of_stream,
     layout_of,
 )
-from steadypose.prior.clean.admission import SLOWEST_NS, SensorPoseGate, StampGate, Verdict
+from steadypose.prior.clean.admission import BACKWARDS_NS, SLOWEST_NS, SensorPoseGate, StampGate, Verdict
 from steadypose.prior.clean.frame import CleanFrame
 from steadypose.prior.clean.identify import Identify
-from steadypose.prior.clean.pipeline import BACKWARDS_NS, CATCH_UP, BodyPipeline
+from steadypose.prior.clean.pipeline import CATCH_UP, BodyPipeline
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS, Resampler
 
@@ -116,7 +116,7 @@ class StreamBatch(BodyPipeline[tuple[str, int]]):
             hurry: whether the node falls behind and should skip grid times that are late.
             gap: as in `PriorPipeline.process`.
         """
-        stamps = self._stamps.pop(raw.source, None) or StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
+        stamps = self._stamps.pop(raw.source, None) or StampGate(self._timeout_ns, self.counters)
         self._stamps[raw.source] = stamps
         if len(self._stamps) > 2 * self._max_streams:
             del self._stamps[next(iter(self._stamps))]

@@ -25,7 +25,7 @@ from steadypose.prior.clean.adapt import (
     layout_of,
     stacked,
 )
-from steadypose.prior.clean.admission import SensorPoseGate, StampGate, Verdict
+from steadypose.prior.clean.admission import BACKWARDS_NS, SensorPoseGate, StampGate, Verdict
 from steadypose.prior.clean.core import CleanCore
 from steadypose.prior.clean.frame import CleanFrame, Observation, SensorNoise
 from steadypose.prior.clean.identify import Identify
@@ -34,8 +34,6 @@ from steadypose.prior.clean.slots import Key, Slots
 from steadypose.prior.timing.rate import FPS
 from steadypose.prior.timing.resample import Frame, Resampler
 
-BACKWARDS_NS = 1_000_000_000
-"""Least step back in time that starts a new stream, nanoseconds; a smaller one is a frame out of order."""
 CATCH_UP = 3
 """Largest number of grid frames that one message completes after messages were dropped. Processing all of them would
 take as long as the dropped messages."""
@@ -133,7 +131,7 @@ class PriorPipeline(BodyPipeline[int]):
         super().__init__(settings)
         self._identify = self._new_identify()
         self._resampler = Resampler(settings.max_bodies, delayed=settings.delay > 0)
-        self._stamps = StampGate(self._timeout_ns, BACKWARDS_NS, self.counters)
+        self._stamps = StampGate(self._timeout_ns, self.counters)
         self._sensor_pose = SensorPoseGate()
         self._recent = RecentMessages()
 

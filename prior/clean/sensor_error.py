@@ -3,9 +3,9 @@
 The correct stage subtracts a known sensor's bias from the observed joints.
 
 `DepthError` estimates, from bones, how much larger an unknown sensor's error is along its line of sight. No filter
-averages out lasting errors, so the smoother's deviations omit part of them: for simulated monocular estimators, whose
-errors lie in depth, the deviations are 1.7 to 2.1 times too small. Errors in depth vary the lengths of bones that point
-to the camera, but hardly those of bones across the line of sight. Half the variance of bone lengths is therefore
+averages out time-correlated errors, so the smoother's deviations omit part of them: for simulated monocular estimators,
+whose errors lie in depth, the deviations are 1.7 to 2.1 times too small. Errors in depth vary the lengths of bones that
+point to the camera, but hardly those of bones across the line of sight. Half the variance of bone lengths is therefore
 fitted, by least squares, as a quadratic form of the bone's direction. The difference between its largest and second
 eigenvalue gives the missing variance. The position of the camera need not be known.
 """

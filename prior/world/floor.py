@@ -126,7 +126,7 @@ class Floor:
         known one. The legs of a person who sits behind a counter are guessed to stand, deep under the floor.
         """
         if observed.feet_observed.any():
-            self.guess(float(np.nanmin(observed.soles[:, 2])))
+            self.initialise(float(np.nanmin(observed.soles[:, 2])))
         if not observed.root_observed:
             return
         soles, sigma = observed.soles, observed.feet_sigma
@@ -134,7 +134,7 @@ class Floor:
         for k in np.flatnonzero(stands & (observed.positions[0, 2] - soles[:, 2] > UPRIGHT_M)):
             self.observe(soles[k], math.hypot(sigma[k], SOLE_SIGMA), max(observed.dt, FRAME_S))
 
-    def guess(self, lowest: float) -> None:
+    def initialise(self, lowest: float) -> None:
         """Initialise an unknown floor as if the lowest observed foot, at this height in metres, stood on it."""
         if not self.known:
             self.height, self._variance = lowest, GUESS_SIGMA**2

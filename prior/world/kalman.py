@@ -71,7 +71,7 @@ class BodyFilter:
     """Kalman filter of root position and velocity, positions of ``feet`` points of the feet, and biases.
 
     It starts from the first observed position (3,) of the root, metres, and a velocity (3,) m/s; ``jitter`` and
-    ``bias`` are standard deviations of the sensor's independent and of its slow error, metres. ``placed`` (feet,) is
+    ``bias`` are standard deviations of the sensor's white noise and of its bias, metres. ``placed`` (feet,) is
     which feet have a position.
     """
 

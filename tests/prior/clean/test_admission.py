@@ -12,7 +12,6 @@ from tests.helpers.values import clean
 from steadypose.msgs.types import PoseClean, PoseRaw
 from steadypose.prior.clean.admission import ACCEPT_AFTER, StampGate
 from steadypose.prior.clean.batch import StreamBatch
-from steadypose.prior.clean.pipeline import BACKWARDS_NS
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.timing.resample import PERIOD_NS
 
@@ -80,7 +79,7 @@ def test_a_server_drops_a_wrong_stamp_of_one_stream_alone(frames: list[PoseRaw])
 
 
 def gate(counters: Counter[str] | None = None) -> StampGate:
-    return StampGate(0.5 * SECOND_NS, BACKWARDS_NS, Counter() if counters is None else counters)
+    return StampGate(0.5 * SECOND_NS, Counter() if counters is None else counters)
 
 
 def test_a_slow_stream_is_a_stream() -> None:

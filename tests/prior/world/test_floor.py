@@ -21,9 +21,9 @@ def stand(floor: Floor, height: float, seconds: float, at: tuple[float, float] =
 def test_uncalibrated_floor_is_unknown_then_found():
     floor = Floor(calibrated=False)
     assert not floor.known
-    floor.guess(-1.3)
+    floor.initialise(-1.3)
     assert floor.sigma == pytest.approx(0.15)
-    floor.guess(-1.0)
+    floor.initialise(-1.0)
     assert floor.height == -1.3, "only the first is needed"
     stand(floor, -1.2, seconds=10)
     assert floor.height == pytest.approx(-1.2, abs=0.01)
