@@ -66,35 +66,25 @@ class TrainingOptions:
 class Recipe(Generic[Network]):
     """The model-specific part of a training."""
 
-    model: str
-    """the model's name"""
-    network: Callable[[], Network]
-    """creates the untrained network"""
+    model: str  # the model's name
+    network: Callable[[], Network]  # creates the untrained network
     loss: Callable[[Network, int, float, Rng], tuple[Tensor, dict[str, float]]]
     """returns the loss of a random batch, and terms to plot. It is called with the network in training mode, the number
     of samples, the progress of the training in [0, 1), and a random generator, which differs between torchrun's
     processes"""
     evaluate: Callable[[Network], dict[str, float]]
     """returns further quantities to plot, on validation data; called in evaluation mode, without gradients"""
-    iterations: int
-    """default number of optimiser steps"""
-    batch: int
-    """samples per step, of all processes together"""
-    rate: float
-    """initial learning rate"""
-    sample: str = "windows"
-    """name of a sample, in the plural"""
-    decay: float = 0.0
-    """weight decay"""
-    optimiser: type[Adam] = AdamW
-    """AdamW, or Adam where a paper uses it"""
+    iterations: int  # default number of optimiser steps
+    batch: int  # samples per step, of all processes together
+    rate: float  # initial learning rate
+    sample: str = "windows"  # name of a sample, in the plural
+    decay: float = 0.0  # weight decay
+    optimiser: type[Adam] = AdamW  # AdamW, or Adam where a paper uses it
     schedule: Callable[[Optimizer, int], LRScheduler] | None = None
     """creates the learning rate schedule from the optimiser and the number of steps; by default, a cosine down to a
     hundredth"""
-    evaluations: int = 40
-    """number of evaluations and checkpoints"""
-    clip: float = 1.0
-    """maximum norm of the gradient"""
+    evaluations: int = 40  # number of evaluations and checkpoints
+    clip: float = 1.0  # maximum norm of the gradient
     parameters: Callable[[Network], list[nn.Parameter]] | None = None
     """the network's trained parameters; all by default"""
     average: float | None = None

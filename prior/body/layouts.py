@@ -57,14 +57,11 @@ NEEDED = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")  # canonic
 class Skeleton:
     """A sensor's joints and their mapping to the canonical joints."""
 
-    name: str
-    """the name that messages and files use"""
-    joints: tuple[str, ...]
-    """the sensor's joint names, in the sensor's order"""
+    name: str  # the name that messages and files use
+    joints: tuple[str, ...]  # the sensor's joint names, in the sensor's order
     table: Mapping[str, str | Mapping[str, float]]
     """canonical joint -> sensor joint, or sensor joints with weights (normalised to sum to 1)"""
-    interpolated: frozenset[str] = frozenset()
-    """canonical joints that are only about where the table has them"""
+    interpolated: frozenset[str] = frozenset()  # canonical joints that are only about where the table has them
 
     @cached_property
     def to_canonical(self) -> Floats:

@@ -41,17 +41,13 @@ HUMAN: Floats = np.linalg.norm(REST_POSITIONS[SPANS[:, 0]] - REST_POSITIONS[SPAN
 class Likeness:
     """The fit of joints, read in the order of a layout, to a human body."""
 
-    skeleton: str
-    """the layout in which they are read"""
-    scale: float
-    """ratio of their lengths to an adult's: 1 in metres, 1000 in millimetres"""
+    skeleton: str  # the layout in which they are read
+    scale: float  # ratio of their lengths to an adult's: 1 in metres, 1000 in millimetres
     error: float
     """RMS over the spans of the logarithm of the ratio of a length to the human length at that scale, and of its spread
     over time. A statue with the proportions of the canonical skeleton has 0"""
-    worst: str
-    """the span that differs most"""
-    ratio: float
-    """ratio of that span's length to the human length at that scale"""
+    worst: str  # the span that differs most
+    ratio: float  # ratio of that span's length to the human length at that scale
 
     @property
     def is_body(self) -> bool:
@@ -92,8 +88,7 @@ def likenesses(positions: NDArray[np.floating]) -> list[Likeness]:
 class Stance:
     """Up axis and handedness of bodies in their frame."""
 
-    up: Floats
-    """(3,) unit vector from feet to heads, in the frame of the joints"""
+    up: Floats  # (3,) unit vector from feet to heads, in the frame of the joints
     handed: float
     """-1 to 1, agreement of toes, noses and knees with the forward direction that left and right imply. It is near -1
     for a mirrored body, and NaN if no joint shows it"""

@@ -62,15 +62,12 @@ BY_RIG = "steadypose clean --rig FILE (docs/sources.md#motion-capture)"
 class Rig:
     """The mapping from a motion file's skeleton to the canonical one."""
 
-    skeleton: Skeleton
-    """the file's joints that are used, and their table"""
-    metres: float
-    """the file's unit, metres"""
+    skeleton: Skeleton  # the file's joints that are used, and their table
+    metres: float  # the file's unit, metres
     lost_bones: Mapping[str, float] = field(default_factory=dict)
     """joints whose OFFSET is zero because a converter lost it, each with the bone's length as a multiple of its
     parent's OFFSET, whose direction it shares"""
-    up: str = ""
-    """the file's axis that points up: ``y``, ``-y`` or ``z``; empty if the motion determines it"""
+    up: str = ""  # the file's axis that points up: ``y``, ``-y`` or ``z``; empty if the motion determines it
 
 
 def mirror_names(names: Sequence[str]) -> dict[str, str]:

@@ -16,20 +16,13 @@ NEAREST, FARTHEST = 0.05, 100.0  # range of distances of a point from the camera
 class KeyPointRecording:
     """One person's key points at the times of a 30 Hz grid, in canonical joints."""
 
-    stamps_ns: NDArray[np.int64]
-    """(T,) stamps of the grid, nanoseconds"""
-    pixels: Floats
-    """(T, 22, 2); NaN where not detected"""
-    confidence: Floats
-    """(T, 22) in 0..1"""
-    focal: Floats
-    """(2,) focal lengths, pixels"""
-    centre: Floats
-    """(2,) principal point, pixels"""
-    rotation: Floats
-    """(3, 3) rotation from the camera's frame to a z-up frame"""
-    camera_height: float | None
-    """metres above the floor; None if unknown"""
+    stamps_ns: NDArray[np.int64]  # (T,) stamps of the grid, nanoseconds
+    pixels: Floats  # (T, 22, 2); NaN where not detected
+    confidence: Floats  # (T, 22) in 0..1
+    focal: Floats  # (2,) focal lengths, pixels
+    centre: Floats  # (2,) principal point, pixels
+    rotation: Floats  # (3, 3) rotation from the camera's frame to a z-up frame
+    camera_height: float | None  # metres above the floor; None if unknown
     points: Floats | None
     """(T, N, 3) metres, points of the body's surface in the camera's frame; None if there are none"""
 

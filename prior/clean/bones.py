@@ -132,10 +132,8 @@ class PersonEstimator:
 class SensorBias(NamedTuple):
     """The sensor's bias, and its effect on lengths."""
 
-    bias_sigma: Floats
-    """(S,) metres along an axis, estimated from each body"""
-    length_variance: Floats
-    """(S, R) m², variance of each `RIGID` segment's observed length about the person's bone"""
+    bias_sigma: Floats  # (S,) metres along an axis, estimated from each body
+    length_variance: Floats  # (S, R) m², variance of each `RIGID` segment's observed length about the person's bone
     lengths: Floats
     """(S, 22) metres, length of each joint's bone: mean of the lately observed one and the person's, weighted by their
     variances; 0 for the root"""

@@ -61,13 +61,11 @@ class BodyWindows:
 class Person:
     """The bones of every body."""
 
-    offsets: Floats
-    """(S, 22, 3) metres, each joint in its parent's frame"""
+    offsets: Floats  # (S, 22, 3) metres, each joint in its parent's frame
     length_variance: Floats
     """(S, 22) metres^2, the part of each bone length's variance that further measurements will reduce; 0 for a generic
     adult"""
-    measured: Bools
-    """(S,) True for the person's own bones, False for a generic adult's"""
+    measured: Bools  # (S,) True for the person's own bones, False for a generic adult's
 
     @classmethod
     def generic(cls, slots: int) -> Person:

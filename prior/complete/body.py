@@ -136,8 +136,7 @@ class Uncertainty:
     """(22,) metres along an axis, standard deviation of each joint far from the frames in which it is known"""
     half: float
     """frames from a joint's last known frame at which its standard deviation is half of that, if none follows"""
-    posture: LivePosture
-    """Gaussian of postures, for joints that are known in no frame"""
+    posture: LivePosture  # Gaussian of postures, for joints that are known in no frame
 
     def of(self, given: Floats) -> Floats:
         """(T, 22) metres along an axis, standard deviations of joints (T, 22, 3) metres, NaN where not given.
@@ -182,12 +181,9 @@ class Completed:
 
     positions: Floats
     """(T, 22, 3) metres, world, z up; NaN more than `LONGEST_GAP` frames before or after all known frames"""
-    rotations: Floats
-    """(T, 22, 3, 3) local; NaN likewise"""
-    known: Bools
-    """(T, 22) which joints were given"""
-    span: int
-    """length of the longest gap that was filled, frames"""
+    rotations: Floats  # (T, 22, 3, 3) local; NaN likewise
+    known: Bools  # (T, 22) which joints were given
+    span: int  # length of the longest gap that was filled, frames
 
 
 def complete(

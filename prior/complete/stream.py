@@ -60,12 +60,9 @@ class Stretch:
 class Completion:
     """The completion of a recording."""
 
-    anchor_ns: int
-    """stamp of the grid's first frame"""
-    done: list[tuple[Stretch, Completed]]
-    """every stretch with its completion"""
-    clean: list[PoseClean]
-    """``pose/clean`` of the frames with a body, and the end of the stream"""
+    anchor_ns: int  # stamp of the grid's first frame
+    done: list[tuple[Stretch, Completed]]  # every stretch with its completion
+    clean: list[PoseClean]  # ``pose/clean`` of the frames with a body, and the end of the stream
     centred: list[int]
     """ids of bodies whose pelvis is at the origin, so that their trajectory is predicted from their motion"""
 

@@ -59,20 +59,14 @@ class Quantity(NamedTuple):
 class Arm(NamedTuple):
     """One arm."""
 
-    raised: Quantity
-    """Height of the fingertips above the neck, from the forearm's direction, metres."""
-    elbow: Quantity
-    """Inner angle, radians; pi is straight."""
-    lift: float
-    """Angle between the line from shoulder to wrist and the nearer vertical, radians."""
+    raised: Quantity  # height of the fingertips above the neck, from the forearm's direction, metres
+    elbow: Quantity  # inner angle, radians; pi is straight
+    lift: float  # angle between the line from shoulder to wrist and the nearer vertical, radians
     swing: float
     """Angle of the forearm from upright, towards the body's left, radians; NaN if unobserved, as guesses jitter."""
-    up: bool
-    """Whether the hand is at least as high as the chest."""
-    upright: bool
-    """Whether, in addition, the forearm points up."""
-    wrist: Point
-    """(3,) metres, world."""
+    up: bool  # whether the hand is at least as high as the chest
+    upright: bool  # whether, in addition, the forearm points up
+    wrist: Point  # (3,) metres, world
     direction: Floats
     """(3,) unit vector, world, from the head through the wrist: the most accurate line of pointing (Nickel and
     Stiefelhagen 2007)."""
@@ -81,27 +75,18 @@ class Arm(NamedTuple):
 class Features(NamedTuple):
     """Quantities of one body at one time."""
 
-    distance: Quantity
-    """Horizontal distance from sensor to pelvis, metres."""
-    to_sensor: tuple[float, float]
-    """(2,) horizontal vector from the pelvis to the sensor, metres."""
+    distance: Quantity  # horizontal distance from sensor to pelvis, metres
+    to_sensor: tuple[float, float]  # (2,) horizontal vector from the pelvis to the sensor, metres
     across: tuple[float, float]
     """(2,) horizontal vector from right to left, hips and shoulders together, metres, normal to the heading; from the
     rotations of pelvis and chest, because bone lengths and the whole body correct their joints."""
-    across_sigma: float
-    """Standard deviation of each component of `across`, metres."""
-    extension: Quantity
-    """Height of the hips above the lower ankle, leg lengths."""
-    thigh: Quantity
-    """Angle of the more upright thigh from straight down, radians."""
-    extent: Quantity
-    """Vertical extent of head, trunk, knees and feet, metres."""
-    neck: float
-    """Height of the neck in the world, metres."""
-    trunk: float
-    """Height of the neck above the pelvis, trunk lengths."""
-    arms: tuple[Arm, Arm]
-    """Left and right arm."""
+    across_sigma: float  # standard deviation of each component of `across`, metres
+    extension: Quantity  # height of the hips above the lower ankle, leg lengths
+    thigh: Quantity  # angle of the more upright thigh from straight down, radians
+    extent: Quantity  # vertical extent of head, trunk, knees and feet, metres
+    neck: float  # height of the neck in the world, metres
+    trunk: float  # height of the neck above the pelvis, trunk lengths
+    arms: tuple[Arm, Arm]  # left and right arm
 
 
 def features(body: WorldBody, sensor: Floats, floor: float = math.nan) -> Features:

@@ -78,10 +78,8 @@ class Seen:
 class Fit:
     """The fit of a body."""
 
-    seen: Seen
-    """the body"""
-    track: FittedTrack | None
-    """the fit; None if it failed, so that ``pose/clean`` stays"""
+    seen: Seen  # the body
+    track: FittedTrack | None  # the fit; None if it failed, so that ``pose/clean`` stays
     misfit: Floats
     """(T, 22) remaining distance from the observations, metres or pixels; NaN where a joint is unobserved"""
 

@@ -87,8 +87,7 @@ class Transitions(Quadratic):
 class FirstState(Quadratic):
     """E_init, by the most likely component of the mixture (max-mixture, Olson and Agarwal 2013)."""
 
-    sigma: float = 1.0
-    """scale of the mixture's standard deviations: 1 is the mixture, more is wider"""
+    sigma: float = 1.0  # scale of the mixture's standard deviations: 1 is the mixture, more is wider
     all_states: bool = False
     """whether it applies to all states and not only the first: a pose prior for stages without a motion prior"""
 

@@ -74,14 +74,10 @@ PICTURES = FitSettings(bones_sigma=0.03, pose_steps=120, motion_steps=200, accel
 class Start:
     """Initial poses of T frames, in the world."""
 
-    root: Tensor
-    """(T, 3) metres"""
-    rotations: Tensor
-    """(T, 22, 3, 3) local"""
-    offsets: Tensor
-    """(22, 3) metres, bones"""
-    ground: float = 0.0
-    """metres, height of the floor"""
+    root: Tensor  # (T, 3) metres
+    rotations: Tensor  # (T, 22, 3, 3) local
+    offsets: Tensor  # (22, 3) metres, bones
+    ground: float = 0.0  # metres, height of the floor
     ground_known: bool = False
     """whether the height is certain, as for a calibrated camera; if not, it is the mean of a prior"""
 

@@ -74,16 +74,11 @@ class Bvh:
 
     joints: tuple[str, ...]
     """names, parents first. The end site of joint ``A`` is ``A_end``; a second one is ``A_end2``"""
-    parents: tuple[int, ...]
-    """index of each joint's parent; -1 for a root"""
-    offsets: NDArray[np.float64]
-    """(J, 3) in the file's unit and axes"""
-    channels: tuple[tuple[str, ...], ...]
-    """channels of each joint, in the file's order"""
-    fps: float
-    """frames per second"""
-    values: NDArray[np.float64]
-    """(T, C) values of all channels, degrees and the file's unit"""
+    parents: tuple[int, ...]  # index of each joint's parent; -1 for a root
+    offsets: NDArray[np.float64]  # (J, 3) in the file's unit and axes
+    channels: tuple[tuple[str, ...], ...]  # channels of each joint, in the file's order
+    fps: float  # frames per second
+    values: NDArray[np.float64]  # (T, C) values of all channels, degrees and the file's unit
 
     @documented
     def positions(self, lost_bones: Mapping[str, float] | None = None) -> NDArray[np.float64]:

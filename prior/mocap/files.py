@@ -39,14 +39,10 @@ class Description:
 
     canonical: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
     """canonical joint -> the file's joint, or several joints of which it is the mean"""
-    metres: float = 0.0
-    """size of the file's unit, metres; 0 to recognise it"""
-    up: str = ""
-    """the axis that points up: ``z``, ``y`` or ``-y``"""
-    fps: float = 0.0
-    """frames per second; 0 for the file's value"""
-    skeleton: str = ""
-    """skeleton of the joints in arrays without names"""
+    metres: float = 0.0  # size of the file's unit, metres; 0 to recognise it
+    up: str = ""  # the axis that points up: ``z``, ``y`` or ``-y``
+    fps: float = 0.0  # frames per second; 0 for the file's value
+    skeleton: str = ""  # skeleton of the joints in arrays without names
 
 
 UNDESCRIBED = Description()

@@ -78,12 +78,9 @@ _HINGES: Mapping[str, _Hinge] = {
 class Calibration:
     """Measurements of a subject."""
 
-    pelvis_width: float
-    """metres between the front markers of the pelvis"""
-    pelvis_depth: float
-    """metres from their midpoint to the midpoint of the back markers"""
-    acromia: float
-    """metres between the shoulder markers"""
+    pelvis_width: float  # metres between the front markers of the pelvis
+    pelvis_depth: float  # metres from their midpoint to the midpoint of the back markers
+    acromia: float  # metres between the shoulder markers
     axis: Mapping[str, float]
     """for each knee and elbow, the angle about the upper limb from its wand to the axis of bending, radians"""
 

@@ -57,14 +57,10 @@ _LEAVES = [joint for joint, children in enumerate(CHILDREN) if not children]
 class CompleterConfig:
     """The sizes of the completer."""
 
-    width: int = 160
-    """width of the transformer's tokens, one per frame"""
-    heads: int = 8
-    """number of attention heads of each layer"""
-    layers: int = 6
-    """number of layers"""
-    reach: int = 64
-    """frames at which relative positions are clipped"""
+    width: int = 160  # width of the transformer's tokens, one per frame
+    heads: int = 8  # number of attention heads of each layer
+    layers: int = 6  # number of layers
+    reach: int = 64  # frames at which relative positions are clipped
     far_sigma: tuple[float, ...] = (0.1,) * JOINTS
     """(22,) metres along an axis, error of each joint far from the frames in which it is known (validation people)"""
     half_frames: float = 10.0
@@ -84,21 +80,15 @@ class Window(NamedTuple):
     """Input of the completer for B windows, each transformed so that the first known root is at the origin and faces
     +x."""
 
-    features: Floats32
-    """(B, T, FEATURES) float32"""
-    rotations: Floats
-    """(B, T, 22, 3, 3) local rotations of the line"""
-    root: Floats
-    """(B, T, 3) metres, root positions of the line"""
+    features: Floats32  # (B, T, FEATURES) float32
+    rotations: Floats  # (B, T, 22, 3, 3) local rotations of the line
+    root: Floats  # (B, T, 3) metres, root positions of the line
     bend: Floats32
     """(B, T, 23, 6) cubics minus the line: first two columns of the rotations and, last, the root (three values in
     metres and three zeros)"""
-    line: Line
-    """the interpolation"""
-    turn: Floats
-    """(B, 3, 3) rotations from the window's frame to the world"""
-    origin: Floats
-    """(B, 3) metres, world, origin of the window's frame"""
+    line: Line  # the interpolation
+    turn: Floats  # (B, 3, 3) rotations from the window's frame to the world
+    origin: Floats  # (B, 3) metres, world, origin of the window's frame
 
 
 def solved_rotations(positions: Floats, offsets: Floats, usual: Floats) -> tuple[Floats, Bools]:

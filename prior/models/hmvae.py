@@ -34,16 +34,12 @@ _NO_ROTATION = np.array(NO_ROTATION, dtype=np.float32)
 class HMVAEConfig:
     """Sizes of an HM-VAE."""
 
-    window: int = 8
-    """T, frames of a window"""
-    kernel: int = 3
-    """time steps of a convolution (official: 3 for T = 8, 15 for T = 64)"""
+    window: int = 8  # T, frames of a window
+    kernel: int = 3  # time steps of a convolution (official: 3 for T = 8, 15 for T = 64)
     strides: tuple[int, int, int, int] = (1, 2, 2, 1)
     """strides of the four encoder blocks (official: 1, 2, 2, 1 for T = 8; 2, 2, 2, 2 for T = 64)"""
-    local_latent: int = 6
-    """dimensions of z_l per edge (official: 6; 12)"""
-    global_latent: int = 6
-    """dimensions of z_g per edge (official: 6; 24)"""
+    local_latent: int = 6  # dimensions of z_l per edge (official: 6; 12)
+    global_latent: int = 6  # dimensions of z_g per edge (official: 6; 24)
     about_mean: bool = False
     """whether each joint's rotations are encoded and decoded in the frame of their observed mean over the window, which
     is also an input of the encoder. The paper encodes the rotations themselves, and its error is mostly constant over

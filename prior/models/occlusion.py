@@ -66,12 +66,9 @@ class Past(NamedTuple):
     poses: Floats
     """(S, 22, 22, 3) metres, for each joint the whole pose, as held, when it was last observed; the last frame's pose
     for a joint never observed; NaN before the first frame"""
-    place: Floats
-    """(S, 22, 3) metres, the joints of the last frame; NaN before"""
-    speed: Floats
-    """(S, 22) m/s, running mean of each joint's speed"""
-    speed_observed: Floats
-    """(S, 22) m/s, its value when the joint was last observed"""
+    place: Floats  # (S, 22, 3) metres, the joints of the last frame; NaN before
+    speed: Floats  # (S, 22) m/s, running mean of each joint's speed
+    speed_observed: Floats  # (S, 22) m/s, its value when the joint was last observed
 
 
 def new_past(slots: int) -> Past:

@@ -26,8 +26,7 @@ FROM_ROOT, SPEED, FASTEST = 0.5, 2.0, 6.0  # unit of positions, metres, and unit
 class TrajectoryConfig:
     """The size of the network, and its errors on validation."""
 
-    hidden: int = 128
-    """size of a body's hidden state"""
+    hidden: int = 128  # size of a body's hidden state
     sigma_scale: tuple[float, float] = (1.0, 1.0)
     """(horizontal, vertical) error-to-sigma ratio of the predicted velocity"""
     correlation_s: tuple[float, float] = (FRAME_S, FRAME_S)

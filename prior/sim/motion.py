@@ -71,12 +71,9 @@ class Motion:
 class ArmAction:
     """An action of an arm, blended with its swing."""
 
-    weight: Floats
-    """(T,) 0 for the swing, 1 for this action"""
-    wrist: Floats
-    """(T, 3) or (3,) metres, target of the wrist in ``frame``"""
-    pole: Floats
-    """(T, 3) or (3,) direction in which the elbow points, in the chest's frame"""
+    weight: Floats  # (T,) 0 for the swing, 1 for this action
+    wrist: Floats  # (T, 3) or (3,) metres, target of the wrist in ``frame``
+    pole: Floats  # (T, 3) or (3,) direction in which the elbow points, in the chest's frame
     frame: Literal["world", "pelvis", "shoulder"]
     """"world"; "pelvis": heading frame of the pelvis, origin at the pelvis; "shoulder": the chest's frame, origin at
     this arm's shoulder, in arm lengths"""
@@ -86,16 +83,13 @@ class ArmAction:
 class Intent:
     """Everything that a script controls; the rest of the body is at rest."""
 
-    plan: Plan
-    """path of the body"""
+    plan: Plan  # path of the body
     shift: Floats = field(init=False)
     """(T, 3) metres, pelvis relative to the plan in the heading frame; z relative to standing"""
-    tilt: Floats = field(init=False)
-    """(T,) radians, forward tilt of the pelvis"""
+    tilt: Floats = field(init=False)  # (T,) radians, forward tilt of the pelvis
     torso: Floats = field(init=False)
     """(T, 3) radians: roll (to the right positive), pitch (forward positive), yaw (to the left positive)"""
-    gaze: Floats = field(init=False)
-    """(T, 2) radians: yaw and pitch of the head beyond the torso's"""
+    gaze: Floats = field(init=False)  # (T, 2) radians: yaw and pitch of the head beyond the torso's
     arms: dict[Side, list[ArmAction]] = field(default_factory=lambda: {"left": [], "right": []})
     """actions of each arm, in order; a later action overrides an earlier one"""
 

@@ -56,45 +56,27 @@ LONGEST_JUMP = 1.2  # longest jump, metres; a joint farther away would not be as
 class NoiseModel:
     """Parameters, in SI units. Axes are along the ray, to its right, up."""
 
-    offset: Floats
-    """(22, 3) metres, standard deviation of the session's offset"""
-    bias: Floats
-    """(22, 3) metres, standard deviation of the drifting bias (median of its log-normal spread)"""
-    bias_length: float
-    """metres of travel over which the bias decays (1/e)"""
-    bias_inertia: float
-    """seconds by which the bias lags, so that it does not shake a fast joint"""
+    offset: Floats  # (22, 3) metres, standard deviation of the session's offset
+    bias: Floats  # (22, 3) metres, standard deviation of the drifting bias (median of its log-normal spread)
+    bias_length: float  # metres of travel over which the bias decays (1/e)
+    bias_inertia: float  # seconds by which the bias lags, so that it does not shake a fast joint
     session_spread: float
     """standard deviation of the logarithm of a joint's error scale in a session. Offset, bias and fast noise are
     proportional to this scale, the rate of jumps to its square"""
-    fast: Floats
-    """(22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread)"""
-    fast_memory: float
-    """seconds, correlation time of the fast noise"""
-    speed_floor: float
-    """m/s, speed below which the fast noise is constant"""
-    speed_exponent: Floats
-    """(22,) exponent; the fast noise is proportional to (speed_floor + speed) to this power"""
-    fast_spread_still: float
-    """standard deviation of the logarithm of the fast noise's size for a joint at rest"""
-    fast_spread_moving: float
-    """the same for speeds well above `SPREAD_SPEED`"""
-    fast_spread_memory: float
-    """seconds, correlation time of that size"""
-    shared: float
-    """share of the variance of bias and fast noise that all joints have in common"""
-    jump_rate: Floats
-    """(22,) 1/s, rate of jumps"""
-    jump_minimum: float
-    """metres, length of the shortest jumps"""
-    jump_tail: float
-    """exponent of the Pareto distribution of their lengths"""
-    jump_short: float
-    """seconds, mean duration of a short jump"""
-    jump_long: float
-    """seconds, mean duration of a long jump"""
-    jump_short_share: float
-    """share of short jumps"""
+    fast: Floats  # (22, 3) metres, standard deviation of the fast noise at 0.3 m/s (median over its spread)
+    fast_memory: float  # seconds, correlation time of the fast noise
+    speed_floor: float  # m/s, speed below which the fast noise is constant
+    speed_exponent: Floats  # (22,) exponent; the fast noise is proportional to (speed_floor + speed) to this power
+    fast_spread_still: float  # standard deviation of the logarithm of the fast noise's size for a joint at rest
+    fast_spread_moving: float  # the same for speeds well above `SPREAD_SPEED`
+    fast_spread_memory: float  # seconds, correlation time of that size
+    shared: float  # share of the variance of bias and fast noise that all joints have in common
+    jump_rate: Floats  # (22,) 1/s, rate of jumps
+    jump_minimum: float  # metres, length of the shortest jumps
+    jump_tail: float  # exponent of the Pareto distribution of their lengths
+    jump_short: float  # seconds, mean duration of a short jump
+    jump_long: float  # seconds, mean duration of a long jump
+    jump_short_share: float  # share of short jumps
 
     @classmethod
     def load(cls, path: Path = KINECT_NOISE) -> NoiseModel:
@@ -115,10 +97,8 @@ class NoiseModel:
 class Errors:
     """A sample of the process."""
 
-    steady: Floats
-    """(..., T, 22, 3) metres along the ray, to its right, up: offset and bias"""
-    quick: Floats
-    """(..., T, 22, 3) metres, fast noise and jumps, which grow with the distance from the camera"""
+    steady: Floats  # (..., T, 22, 3) metres along the ray, to its right, up: offset and bias
+    quick: Floats  # (..., T, 22, 3) metres, fast noise and jumps, which grow with the distance from the camera
     scale: Floats
     """(..., T, 22) metres, the error that a tracker could estimate: the fast noise's scale, half of a jump, and a tenth
     of the steady error"""

@@ -17,12 +17,9 @@ INITIAL_SPEED = 1.0  # standard deviation of a joint's first velocity along an a
 class Smoothed(NamedTuple):
     """The estimate of one frame."""
 
-    stamp_s: float
-    """seconds"""
-    positions: Floats
-    """(..., 3) metres; NaN for a joint that has not been observed yet"""
-    sigma: Floats
-    """(...) metres, standard deviation along an axis; inf where positions are NaN"""
+    stamp_s: float  # seconds
+    positions: Floats  # (..., 3) metres; NaN for a joint that has not been observed yet
+    sigma: Floats  # (...) metres, standard deviation along an axis; inf where positions are NaN
     step: Floats | None = None
     """(..., 3) metres, motion to the next frame, estimated from the same observations; None without a later frame"""
 

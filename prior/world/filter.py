@@ -49,16 +49,11 @@ _UP = np.array([0.0, 0.0, 1.0])
 class RootState:
     """A body's estimated root and feet, in the world."""
 
-    position: Floats
-    """(3,) metres, position of the root"""
-    velocity: Floats
-    """(3,) m/s, velocity of the root"""
-    covariance: Floats
-    """(6, 6) of [position, velocity]: m², m²/s, m²/s²"""
-    feet: Floats
-    """(4, 3) metres, positions of `FEET`; NaN where unknown"""
-    feet_sigma: Floats
-    """(4, 3) metres, standard deviations along each axis"""
+    position: Floats  # (3,) metres, position of the root
+    velocity: Floats  # (3,) m/s, velocity of the root
+    covariance: Floats  # (6, 6) of [position, velocity]: m², m²/s, m²/s²
+    feet: Floats  # (4, 3) metres, positions of `FEET`; NaN where unknown
+    feet_sigma: Floats  # (4, 3) metres, standard deviations along each axis
     shift: Floats
     """(3,) metres by which an unobserved root moves the body's other joints; it decays once the root is observed"""
 

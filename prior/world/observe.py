@@ -45,22 +45,14 @@ _FEET, _SOLE_OFFSETS = list(FEET), SOLE[:, None] * [0.0, 0.0, 1.0]
 class BodyObservation:
     """A body of one message, in the world."""
 
-    body: CleanBody
-    """the body in the message, unchanged"""
-    stamp_ns: int
-    """stamp of the message"""
-    dt: float
-    """seconds since the last message with this body; 0 in the first"""
-    positions: Floats
-    """(22, 3) metres; NaN where unknown"""
-    orientation: Floats
-    """(4,) xyzw, orientation of the root; the last valid one if the message has none"""
-    observed: Bools
-    """(22,) whether each joint was observed and not inferred"""
-    sigma: Floats
-    """(22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none"""
-    root_sigma: float
-    """metres, standard deviation of the root's position; infinite if no observation supports it"""
+    body: CleanBody  # the body in the message, unchanged
+    stamp_ns: int  # stamp of the message
+    dt: float  # seconds since the last message with this body; 0 in the first
+    positions: Floats  # (22, 3) metres; NaN where unknown
+    orientation: Floats  # (4,) xyzw, orientation of the root; the last valid one if the message has none
+    observed: Bools  # (22,) whether each joint was observed and not inferred
+    sigma: Floats  # (22,) metres, standard deviations, at least `MIN_SIGMA`; infinite where the message has none
+    root_sigma: float  # metres, standard deviation of the root's position; infinite if no observation supports it
     pelvis_observed: bool
     """whether the pelvis or a hip was observed; if not, the prior inferred the root from other joints"""
 

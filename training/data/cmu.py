@@ -84,18 +84,14 @@ def read_expmap(file: IO[bytes]) -> Iterator[tuple[float, str, float, NDArray[np
 class Asf:
     """An Acclaim skeleton. A joint here is the *far end* of the bone whose name it carries; ``root`` is first."""
 
-    joints: tuple[str, ...]
-    """``root`` and the bones, parents first"""
-    parents: tuple[int, ...]
-    """index of each joint's parent; -1 for the root"""
+    joints: tuple[str, ...]  # ``root`` and the bones, parents first
+    parents: tuple[int, ...]  # index of each joint's parent; -1 for the root
     offsets: NDArray[np.float64]
     """(J, 3) metres in the skeleton's own axes (y up), from the parent in the pose with all angles 0"""
-    axes: NDArray[np.float64]
-    """(J, 3, 3) the frame in which each bone's angles turn"""
+    axes: NDArray[np.float64]  # (J, 3, 3) the frame in which each bone's angles turn
     freedoms: tuple[tuple[str, ...], ...]
     """the angles each bone has, such as ``('rx', 'rz')``; for the root all six in the file's order"""
-    metres: float
-    """the size of the file's unit"""
+    metres: float  # the size of the file's unit
 
 
 _Bone = tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]  # offset, axis and freedoms, as in `Asf`

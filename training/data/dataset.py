@@ -30,16 +30,11 @@ _ARRAYS = {"clip_start", "split", "set", "rotations", "positions", "offsets", "c
 class MotionSet:
     """Prepared clips of one split, concatenated."""
 
-    rotations: Tensor
-    """(N, 22, 3, 3) local, float32"""
-    positions: Tensor
-    """(N, 22, 3) metres, world, z up, floor at 0"""
-    offsets: Tensor
-    """(N, 22, 3) metres, the person's bones in each frame"""
-    contacts: Tensor
-    """(N, 8) labels"""
-    clip_start: NDArray[np.int64]
-    """(C + 1,) first frame of each clip, and the end"""
+    rotations: Tensor  # (N, 22, 3, 3) local, float32
+    positions: Tensor  # (N, 22, 3) metres, world, z up, floor at 0
+    offsets: Tensor  # (N, 22, 3) metres, the person's bones in each frame
+    contacts: Tensor  # (N, 8) labels
+    clip_start: NDArray[np.int64]  # (C + 1,) first frame of each clip, and the end
     subject: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     """(C,) person, as named by the source; empty if the clips' origin does not matter"""
     source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, dtype=np.str_))

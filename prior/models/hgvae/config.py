@@ -33,21 +33,16 @@ class CompletionConfig:
 class HGVAEConfig:
     """The sizes of an HG-VAE."""
 
-    frames: int = 50
-    """T, frames of a window at 30 Hz (paper: 50)"""
-    coefficients: int = 20
-    """number of coefficients of the cosine transform that are kept, lowest first (paper: all T)"""
-    features: int = 64
-    """F, features of every node in the deterministic streams (paper: 256)"""
+    frames: int = 50  # T, frames of a window at 30 Hz (paper: 50)
+    coefficients: int = 20  # number of coefficients of the cosine transform that are kept, lowest first (paper: all T)
+    features: int = 64  # F, features of every node in the deterministic streams (paper: 256)
     levels: tuple[Level, ...] = (Level(1, 64), Level(8, 32), Level(24, 32), Level(JOINT_NODES, 16))
     """stochastic levels, top level first (paper: 1, 8, 24 and 54 nodes)"""
     stochastic: int | None = None
     """number of random levels, counted from the bottom. Levels above stay at their prior's mean and carry no
     information (table 1: depth at equal capacity). None means all levels"""
-    actions: int = 0
-    """number of action classes, given one-hot beside the top latent; 0 for a model without actions"""
-    completion: CompletionConfig | None = None
-    """sizes of the completion network; None for a model without one"""
+    actions: int = 0  # number of action classes, given one-hot beside the top latent; 0 for a model without actions
+    completion: CompletionConfig | None = None  # sizes of the completion network; None for a model without one
 
     @classmethod
     def from_dict(cls, config: dict[str, Any]) -> HGVAEConfig:

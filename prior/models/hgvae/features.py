@@ -31,12 +31,10 @@ class Tracks(NamedTuple):
 
     x: NDArray[np.float64]
     """(..., 66, T) metres of a body of standard size; node ``3 * joint + axis``. NaN for a joint never observed"""
-    observed: NDArray[np.float64]
-    """(..., 66, T) 1 where observed, else 0"""
+    observed: NDArray[np.float64]  # (..., 66, T) 1 where observed, else 0
     path: NDArray[np.float64]
     """(..., T, 3) metres, world, origin of all joints except the pelvis, whose origin is the path's mean"""
-    yaw: NDArray[np.float64]
-    """(...) radians, mean heading of the window"""
+    yaw: NDArray[np.float64]  # (...) radians, mean heading of the window
 
 
 def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -55,13 +55,11 @@ _NEVER = -1.0
 class Features(NamedTuple):
     """The network's input. Variances are along an axis, in units of `SCALE`."""
 
-    nodes: NDArray[np.float32]
-    """(B, T / patch, inputs) float32"""
+    nodes: NDArray[np.float32]  # (B, T / patch, inputs) float32
     mobility: NDArray[np.float32]
     """(B, 22) float32, mean squared displacement of a joint relative to its parent in `LAG` frames, minus the part that
     noise explains"""
-    noise: NDArray[np.float32]
-    """(B, 22) float32, variance of an observation: jitter and bias"""
+    noise: NDArray[np.float32]  # (B, 22) float32, variance of an observation: jitter and bias
     gap: NDArray[np.float32]
     """(B, 22, T) float32, frames to an observation; 1 / (1 / last + 1 / next) between two; 0 where observed, -1 for a
     joint never observed"""
