@@ -136,15 +136,11 @@ def _interpolate_twist(rotations: Floats, determined: Bools, known: Bools, offse
     if not missing.any():
         return
     solved, line = rotations[..., balls, :, :].reshape(*twist.shape, 3, 3), draw_line(twist)
-    turns, twisted = (
-        quaternions(np.where(twist[..., None, None], solved, np.eye(3))),
-        np.zeros((*twist.shape, 4)),
-    )
+    turns = quaternions(np.where(twist[..., None, None], solved, np.eye(3)))
+    twisted = np.zeros((*twist.shape, 4))
     write_slerp(turns, line.before, line.after, line.weight, line.ever, np.zeros((len(balls), 4)), twisted)
-    before, bones = (
-        rotation_matrices(twisted[missing]),
-        offsets[..., middles, :].reshape(*twist.shape, 3)[missing],
-    )
+    before = rotation_matrices(twisted[missing])
+    bones = offsets[..., middles, :].reshape(*twist.shape, 3)[missing]
     now, then = (_unit((turn @ bones[..., None])[..., 0]) for turn in (solved[missing], before))
     axis = np.cross(then, now)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)

@@ -56,16 +56,7 @@ def _tile(rows: int, vectors: int) -> Any:
 
     @intrinsic
     def write(
-        _: Any,
-        a: Any,
-        weight: Any,
-        shift: Any,
-        product: Any,
-        row: Any,
-        column: Any,
-        start: Any,
-        below: Any,
-        near: Any,
+        _: Any, a: Any, weight: Any, shift: Any, product: Any, row: Any, column: Any, start: Any, below: Any, near: Any
     ) -> Any:
         """Write the tile of ``shift + a @ weight`` that begins at ``row`` and ``column``.
 

@@ -13,14 +13,7 @@ from steadypose.prior.world.feet import Feet, FeetState
 from steadypose.prior.world.filter import RootFilter, RootState
 from steadypose.prior.world.floor import Floor
 from steadypose.prior.world.kalman import BodyNoise
-from steadypose.prior.world.networks import (
-    ContactNetwork,
-    MotionMemory,
-    RootVelocity,
-    Stance,
-    VelocityNetwork,
-    stance,
-)
+from steadypose.prior.world.networks import ContactNetwork, MotionMemory, RootVelocity, Stance, VelocityNetwork, stance
 from steadypose.prior.world.observe import FEET_OF_LEGS, BodyObservation, LegMemory
 from steadypose.prior.world.settings import TrajectorySettings
 
