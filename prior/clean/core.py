@@ -46,9 +46,7 @@ class _Newest(NamedTuple):
     bias: SensorBias  # estimated up to this frame
     correlated: Floats  # (S,) certainty that the sensor's noise is time-correlated, 0 to 1
     correlated_sigma: Floats  # (S,) metres along an axis, the time-correlated part of the sensor's error
-    omitted_sigma: (
-        Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother's deviations omit
-    )
+    omitted_sigma: Floats  # (S,) metres along an axis, the part of the sensor's error that the smoother omits
     rotations: Floats  # (K, S, 22, 3, 3) local, of the last frames
     score: Score
     imputed: Imputed | None  # the last frames, completed; None if no body is
