@@ -22,9 +22,7 @@ from steadypose.prior.timing.rate import FPS
 
 APART = 0.15  # least mean distance of a limb's joints to their predictions to test for an exchange, metres
 BETTER = 0.4  # share to which an exchange must reduce that distance
-CONFIRMED = (
-    4  # number of frames after which an exchange is confirmed: it then ends when the limb is no longer nearer so
-)
+CONFIRMED = 4  # frames after which an exchange is confirmed: from then on it ends when the limb is no longer nearer so
 SIGMA = 0.03  # standard deviation of joints along an axis, when postures are compared, metres
 FIRST = 15  # largest number of a body's first frames that are tested, until one labelling is far likelier
 
