@@ -22,8 +22,7 @@ from steadypose.msgs.types import Diagnostics, Level, Message, Pose, forms_of
 
 MAX_BODIES = 128
 MAX_EVENTS = 16 * MAX_BODIES
-MAX_VALUES = 1000
-"""Largest number of entries in one node's diagnostics."""
+MAX_VALUES = 1000  # largest number of entries in one node's diagnostics
 MAX_NAME = 1024
 """Largest size of a name (source, frame, layout) in UTF-8, bytes. Every node remembers a thousand sources."""
 _HEADER = "iIs"

@@ -26,8 +26,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 VERSION = 2
-MAX_FRAME = 2**20
-"""Largest size of a frame, bytes. 100 people with 100 joints each take 160 kB."""
+MAX_FRAME = 2**20  # largest size of a frame, bytes. 100 people with 100 joints each take 160 kB.
 PREFIX = struct.Struct("<BIIQ")
 
 # No topic begins with this byte. It sorts last, and ZeroMQ sends subscriptions in sorted order: when a subscriber's
@@ -43,10 +42,8 @@ class Listener(NamedTuple):
     name: str
     instance: int
     """random number drawn at start, which distinguishes a restarted process from its predecessor, uint32"""
-    reliable: tuple[str, ...] = ()
-    """topics of which it must not miss a message"""
-    context: int = 0
-    """number of messages per topic to resend even though its predecessor had acknowledged them"""
+    reliable: tuple[str, ...] = ()  # topics of which it must not miss a message
+    context: int = 0  # number of messages per topic to resend even though its predecessor had acknowledged them
 
     def subscription(self) -> bytes:
         """The subscription that identifies it, and that prefixes messages resent to it alone."""
@@ -70,8 +67,7 @@ class Taken(NamedTuple):
 
     instance: int
     publisher: int
-    following: int
-    """sequence number of the message that it expects next"""
+    following: int  # sequence number of the message that it expects next
     topic: str
 
     def frame(self) -> bytes:
@@ -91,24 +87,19 @@ WINDOW = 256
 """Number of unacknowledged messages of a topic at which the publisher waits for a reliable subscriber.
 
 With `MAX_CONTEXT` and other messages it stays below ZeroMQ's queue for a subscriber, so ZeroMQ drops none."""
-MAX_CONTEXT = 512
-"""Largest number of acknowledged messages that a subscriber can request as context."""
+MAX_CONTEXT = 512  # largest number of acknowledged messages that a subscriber can request as context
 DEAF_S = 10.0
 """Silence after which the publisher no longer waits for a subscriber that has unread messages, seconds."""
-WRAP = 2**32
-"""Modulus of sequence numbers, which are uint32."""
+WRAP = 2**32  # modulus of sequence numbers, which are uint32
 
 
 @dataclass(eq=False)
 class _Progress:
     """Progress of a subscriber."""
 
-    following: dict[str, int]
-    """by topic, the sequence number of the next message to be acknowledged"""
-    context: int
-    """number of acknowledged messages that it requests if it restarts"""
-    sign_s: float
-    """time of its last sign of life, or since which it has unread messages, monotonic seconds"""
+    following: dict[str, int]  # by topic, the sequence number of the next message to be acknowledged
+    context: int  # number of acknowledged messages that it requests if it restarts
+    sign_s: float  # time of its last sign of life, or since which it has unread messages, monotonic seconds
 
     def silent_s(self, sequence: Mapping[str, int]) -> float:
         """Time for which it has had unread messages without a sign of life, seconds."""
@@ -228,10 +219,8 @@ def _ahead(sequence: int, following: int) -> bool:
     return (sequence - following) % WRAP < WRAP // 2
 
 
-AWAY_S = 1.0
-"""Time of silence after which another publisher may take over a source, seconds."""
-MOST = 1024
-"""Largest number of remembered streams."""
+AWAY_S = 1.0  # time of silence after which another publisher may take over a source, seconds
+MOST = 1024  # largest number of remembered streams
 
 
 class _Principal(NamedTuple):

@@ -26,12 +26,9 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Header, MessageIndex, Schema
 
-MAX_CHUNK = 2**26
-"""Largest decompressed size of a chunk, bytes. Writers close their chunks at some megabytes."""
-MAX_RATIO = 250
-"""Largest compression ratio of a chunk larger than `RATIO_FROM`. Skeletons reach at most 100."""
-RATIO_FROM = 2**20
-"""Decompressed size of a chunk above which `MAX_RATIO` applies, bytes."""
+MAX_CHUNK = 2**26  # largest decompressed size of a chunk, bytes. Writers close their chunks at some megabytes.
+MAX_RATIO = 250  # largest compression ratio of a chunk larger than `RATIO_FROM`. Skeletons reach at most 100.
+RATIO_FROM = 2**20  # decompressed size of a chunk above which `MAX_RATIO` applies, bytes
 FILE_RATIO_FROM = 2**24
 """Decompressed size that any file's chunks may reach together, bytes. Beyond it, `MAX_RATIO` times the file size."""
 MIN_RECORD = 31

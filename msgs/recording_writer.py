@@ -50,12 +50,10 @@ class PartInfo:
     """The entries of one file in `metadata.yaml`."""
 
     path: Path
-    counts: Counter[str] = field(default_factory=Counter)
-    """number of messages by topic"""
+    counts: Counter[str] = field(default_factory=Counter)  # number of messages by topic
     first_ns: int = 2**63 - 1
     last_ns: int = 0
-    first_of: dict[str, int] = field(default_factory=dict)
-    """log time of each topic's first message, nanoseconds"""
+    first_of: dict[str, int] = field(default_factory=dict)  # log time of each topic's first message, nanoseconds
 
 
 class RecordingWriter(Closing):

@@ -30,8 +30,7 @@ class TransportError(ValueError):
     """An address or a key that cannot or must not be used. The text says what to do."""
 
 
-MAX_PORT = 65535
-"""ZeroMQ takes a larger one modulo 65536."""
+MAX_PORT = 65535  # ZeroMQ takes a larger one modulo 65536
 
 
 def parse(endpoint: str) -> tuple[str, str]:
@@ -123,8 +122,7 @@ def local_address(node: str) -> str:
     return f"ipc://{local_directory() / node}"
 
 
-MADE_S = 2.0
-"""Longest time to wait for another process that creates this user's keys, seconds."""
+MADE_S = 2.0  # longest time to wait for another process that creates this user's keys, seconds
 _OWN = "own"
 
 
@@ -134,12 +132,9 @@ class Keys:
 
     public: bytes
     secret: bytes = field(repr=False)
-    server: bytes
-    """public key that a subscriber expects from its publishers"""
-    servers: Mapping[str, bytes]
-    """public keys of publishers with individual keys, by host"""
-    directory: Path
-    """directory that the keys were read from, and in which the clients' are"""
+    server: bytes  # public key that a subscriber expects from its publishers
+    servers: Mapping[str, bytes]  # public keys of publishers with individual keys, by host
+    directory: Path  # directory that the keys were read from, and in which the clients' are
 
     def server_at(self, endpoint: str) -> bytes:
         """The public key of the publisher at an address. Raises TransportError if there is no key for its host."""

@@ -28,8 +28,7 @@ POSE_RAW = "pose/raw"
 POSE_CLEAN = "pose/clean"
 POSE_WORLD = "pose/world"
 POSE_EVENTS = "pose/events"
-POSE_TRUTH = "pose/truth"
-"""Topic of a simulated stream's ground truth."""
+POSE_TRUTH = "pose/truth"  # topic of a simulated stream's ground truth
 DIAGNOSTICS = "diagnostics"
 
 TOPICS: Mapping[str, type[Message]] = MappingProxyType(
@@ -52,8 +51,7 @@ def check_topic(topic: str, message: Message) -> None:
         raise ValueError(f"{topic}: expected {TOPICS[topic].__name__}, got {type(message).__name__}")
 
 
-NORM_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's norm from 1."""
+NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
 
 
 def broken(body: CleanBody | WorldBody) -> str | None:

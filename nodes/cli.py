@@ -45,10 +45,8 @@ COMMANDS = {
     "keys": ("small", "make CurveZMQ keys, for messages between machines"),
 }
 """Module and one-line help of each command. Modules without a dot in their name are in `nodes.commands`."""
-TOPICS = ("upgrade", "uninstall")
-"""What `help` explains beside the commands."""
-USAGE_ERROR = 2
-"""Exit status of a request that cannot succeed and should not be retried."""
+TOPICS = ("upgrade", "uninstall")  # what `help` explains beside the commands
+USAGE_ERROR = 2  # exit status of a request that cannot succeed and should not be retried
 INTERRUPTED = 130
 
 

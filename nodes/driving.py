@@ -33,10 +33,8 @@ if TYPE_CHECKING:
 
 CHECKED, CHECKED_NS = 45, 1_500_000_000
 """Number of frames between checks of the input, and the time that they are assumed to take, nanoseconds."""
-ENOUGH = 8
-"""Number of joints of a body that are certainly enough for a pose."""
-LYING = ("up_axis", "not_upright")
-"""Causes of problems that somebody who lies or leans for a while also has."""
+ENOUGH = 8  # number of joints of a body that are certainly enough for a pose
+LYING = ("up_axis", "not_upright")  # causes of problems that somebody who lies or leans for a while also has
 Settings = Mapping[str, Mapping[str, Any]]
 
 

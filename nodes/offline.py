@@ -35,24 +35,18 @@ if TYPE_CHECKING:
     from steadypose.prior.fit.windows import FittedTrack
 
 
-CHECKED = 100
-"""About how many frames of a recording are checked for faults before it is completed."""
+CHECKED = 100  # about how many frames of a recording are checked for faults before it is completed
 
 
 class CompletedSource(NamedTuple):
     """The output of `complete_source`."""
 
-    raws: list[PoseRaw]
-    """the unchanged ``pose/raw``, with the end of the stream"""
-    outputs: list[tuple[str, Message]]
-    """``pose/clean`` and ``pose/world`` with their topics, in order"""
+    raws: list[PoseRaw]  # the unchanged ``pose/raw``, with the end of the stream
+    outputs: list[tuple[str, Message]]  # ``pose/clean`` and ``pose/world`` with their topics, in order
     completion: Completion
-    refused: dict[str, int]
-    """number of refused or dropped messages, by cause"""
-    problems: list[str]
-    """probable faults of the joints, as text"""
-    bodies: tuple[int, ...]
-    """ids along the source's axis of bodies, if it has one"""
+    refused: dict[str, int]  # number of refused or dropped messages, by cause
+    problems: list[str]  # probable faults of the joints, as text
+    bodies: tuple[int, ...]  # ids along the source's axis of bodies, if it has one
 
     def messages(self) -> list[tuple[str, Message]]:
         """All messages, ordered by stamp."""
@@ -117,16 +111,11 @@ def _problems(raws: Sequence[PoseRaw]) -> list[str]:
 class Fitted(NamedTuple):
     """The output of `fit_source`."""
 
-    messages: list[tuple[str, Message]]
-    """messages of all topics, with the fitted poses"""
-    stamps_ns: NDArray[np.int64]
-    """(T,) stamps of the source's frames, nanoseconds"""
-    fits: list[Fit]
-    """the fit of each body over the time that it was observed"""
-    problems: list[str]
-    """what is wrong with the source's joints"""
-    bodies: tuple[int, ...]
-    """ids along the source's axis of bodies, if it has one"""
+    messages: list[tuple[str, Message]]  # messages of all topics, with the fitted poses
+    stamps_ns: NDArray[np.int64]  # (T,) stamps of the source's frames, nanoseconds
+    fits: list[Fit]  # the fit of each body over the time that it was observed
+    problems: list[str]  # what is wrong with the source's joints
+    bodies: tuple[int, ...]  # ids along the source's axis of bodies, if it has one
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of ``clean``, one row per frame. If exactly one body was fitted, also its bones and the ground."""

@@ -14,8 +14,7 @@ from steadypose import PACKAGE
 from steadypose.prior.settings import MODEL
 
 _PATH = "path"
-STREAMS = "sim_data"
-"""Folder of the bundled streams."""
+STREAMS = "sim_data"  # folder of the bundled streams
 
 
 class LaunchError(ValueError):

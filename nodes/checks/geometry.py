@@ -18,19 +18,15 @@ from steadypose.prior.body.likeness import Likeness, Stance, likeness, likenesse
 from steadypose.prior.body.skeleton import J, at_origin
 from steadypose.prior.clean.admission import MAX_DISTANCE
 
-ENOUGH = 15
-"""Smallest number of messages to judge by."""
-SIZES = (0.5, 1.4)
-"""Range of body sizes relative to an adult, from a child of three to the tallest adult."""
+ENOUGH = 15  # smallest number of messages to judge by
+SIZES = (0.5, 1.4)  # range of body sizes relative to an adult, from a child of three to the tallest adult
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "metres divided by 1000": 0.001}
 ADULT_M = 1.72
 UPRIGHT, ALONG = 0.5, 0.85
 """Cosines of the body's up direction: with the vertical, above which it counts as upright; with an axis of its frame,
 above which it stands along that axis."""
-MIRRORED = -0.2
-"""Handedness below which a body counts as mirrored. Correct trackers stay above 0.2."""
-FASTEST = 8.0
-"""Largest speed of a body, body heights per second; twice a sprinter's."""
+MIRRORED = -0.2  # handedness below which a body counts as mirrored. Correct trackers stay above 0.2.
+FASTEST = 8.0  # largest speed of a body, body heights per second; twice a sprinter's
 RUNNER_M_S, LIMB_M_S = 7.0, 8.0
 """Largest sustained speeds of a body, and of a limb relative to the trunk, m/s. In motion capture of actors, dancers
 and sprinters, the largest medians over 1.5 s are 3.7 and 4.8 m/s."""

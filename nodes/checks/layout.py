@@ -28,13 +28,11 @@ _LAYOUT_OF = {
     "body38": "zed38",
 }
 """Names by which others know a layout, in small letters and without separators."""
-ENOUGH = 5
-"""Smallest number of messages to judge by."""
+ENOUGH = 5  # smallest number of messages to judge by
 HANDOVERS = 3
 """Smallest number of handovers from one id to another in a window that make a problem: a tracker that loses a person
 now and then has fewer."""
-SAME_PLACE = 0.15
-"""Largest distance between two bodies in one place, relative to their size."""
+SAME_PLACE = 0.15  # largest distance between two bodies in one place, relative to their size
 
 
 def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterator[Problem]:

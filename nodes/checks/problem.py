@@ -12,20 +12,16 @@ from numpy.typing import NDArray
 from steadypose.msgs.subscriber import HANDSHAKE, SECOND
 from steadypose.msgs.types import Level, PoseRaw, RawBody
 
-PREFIX = "problem."
-"""Prefix of the keys in `diagnostics` whose values are problems."""
+PREFIX = "problem."  # prefix of the keys in `diagnostics` whose values are problems
 
 
 @dataclass(frozen=True)
 class Problem:
     """A problem with a stream."""
 
-    level: Level
-    """ERROR if no useful output is possible, WARN if the output is worse than it could be"""
-    cause: str
-    """one word; docs/troubleshooting.md has an entry for each"""
-    text: str
-    """what was received, what was expected, and what to do"""
+    level: Level  # ERROR if no useful output is possible, WARN if the output is worse than it could be
+    cause: str  # one word; docs/troubleshooting.md has an entry for each
+    text: str  # what was received, what was expected, and what to do
 
     def __str__(self) -> str:
         return f"{self.cause}: {self.text}"
@@ -49,8 +45,7 @@ def from_values(values: Mapping[str, str]) -> dict[str, str]:
     return {key.removeprefix(PREFIX): text for key, text in values.items() if key.startswith(PREFIX)}
 
 
-JUDGED = 4
-"""Largest number of bodies per message whose joints are examined."""
+JUDGED = 4  # largest number of bodies per message whose joints are examined
 
 
 def bodies(messages: Sequence[PoseRaw]) -> Iterator[RawBody]:

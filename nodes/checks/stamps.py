@@ -13,23 +13,17 @@ from steadypose.nodes.checks.problem import Problem, error, warning
 from steadypose.prior.timing.rate import FPS
 
 SECOND_NS = 1_000_000_000
-ENOUGH = 10
-"""Smallest number of messages to judge by."""
-RATES_HZ = (4.0, 300.0)
-"""Range of trackers' frame rates, Hz."""
-SLOW_HZ = 9.0
-"""Frame rate below which half of the motion is lost between two frames, Hz."""
+ENOUGH = 10  # smallest number of messages to judge by
+RATES_HZ = (4.0, 300.0)  # range of trackers' frame rates, Hz
+SLOW_HZ = 9.0  # frame rate below which half of the motion is lost between two frames, Hz
 UNITS = {"seconds": 1e9, "milliseconds": 1e6, "microseconds": 1e3, "ticks of 100 ns": 100.0}
 AHEAD_NS = 300_000_000
 """Largest tolerated lead of stamps over this machine's clock, nanoseconds. Two clocks set by hand stay below it."""
-UNSORTED = 2 / 3
-"""Share of stamps older than an earlier one from which no useful output is possible, ratio."""
+UNSORTED = 2 / 3  # share of stamps older than an earlier one from which no useful output is possible, ratio
 STEP_NS = 500_000_000
 """Change of the offset between stamps and clock, between two messages, that shows that a clock was set, ns."""
-SECONDS_BELOW = 10**11
-"""Upper bound of stamps that may be seconds since 1970, seconds; valid until the year 5138."""
-SETTLED = 8
-"""Smallest number of messages before and after such a step."""
+SECONDS_BELOW = 10**11  # upper bound of stamps that may be seconds since 1970, seconds; valid until the year 5138
+SETTLED = 8  # smallest number of messages before and after such a step
 
 
 def check_stamps(stamps: NDArray[np.int64], arrived: NDArray[np.int64] | None) -> Iterator[Problem]:

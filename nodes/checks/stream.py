@@ -17,10 +17,8 @@ from steadypose.nodes.checks.stamps import ENOUGH as ENOUGH_STAMPS
 from steadypose.nodes.checks.stamps import check_stamps
 from steadypose.prior.clean.settings import PriorSettings
 
-ENOUGH = 20
-"""Smallest number of bodies between two checks to judge by."""
-MAX_SHARE = 0.7
-"""Largest normal share of refused joints, or of flagged poses, ratio."""
+ENOUGH = 20  # smallest number of bodies between two checks to judge by
+MAX_SHARE = 0.7  # largest normal share of refused joints, or of flagged poses, ratio
 CHECKS = 3
 """Number of successive checks with nearly all poses flagged that make a problem. The flag reports shorter faults."""
 
@@ -67,16 +65,12 @@ class OutputCheck:
 
 LENGTHS_NS = (1_500_000_000, 2_500_000_000)
 """Length of the window of messages that are examined, nanoseconds, and of a slow stream's."""
-LONGEST = 90
-"""Largest number of messages in the window."""
-SILENT_NS = 2_000_000_000
-"""Time without a message after which a stream counts as stopped, nanoseconds."""
+LONGEST = 90  # largest number of messages in the window
+SILENT_NS = 2_000_000_000  # time without a message after which a stream counts as stopped, nanoseconds
 SET_NS = 10_000_000_000
 """Time between two checks, which a node makes every second, from which the wall clock was set, nanoseconds."""
-AT_ONCE = 4
-"""Largest number of streams examined in one call, in turn, because a server's frames wait meanwhile."""
-NOBODY = 60
-"""Number of messages without any body that make a problem."""
+AT_ONCE = 4  # largest number of streams examined in one call, in turn, because a server's frames wait meanwhile
+NOBODY = 60  # number of messages without any body that make a problem
 
 
 class StreamCheck:

@@ -35,10 +35,8 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.npz import SUFFIXES
 
 MANIFEST = "manifest.jsonl"
-_LINE = '{"input": '
-"""how each line of it begins"""
-FILES = (".npz", ".csv", *SUFFIXES)
-"""endings of files of poses that are cleaned into an .npz each"""
+_LINE = '{"input": '  # how each line of it begins
+FILES = (".npz", ".csv", *SUFFIXES)  # endings of files of poses that are cleaned into an .npz each
 CLEAN = "clean"
 
 
@@ -48,8 +46,7 @@ class Job:
 
     source: Path
     out: Path
-    replace: bool = False
-    """whether an earlier call made what is at ``out``"""
+    replace: bool = False  # whether an earlier call made what is at ``out``
 
 
 def is_folder_of_recordings(path: Path) -> bool:

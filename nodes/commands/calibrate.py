@@ -30,8 +30,7 @@ from steadypose.prior.camera.calibration import (
 )
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "letter": (279.4, 215.9)}
-GOOD_SIGMA_M = 0.005
-"""a place less sure than this is worth another try"""
+GOOD_SIGMA_M = 0.005  # a place less sure than this is worth another try
 DPI = 300
 LaunchFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LAUNCH")]
 Images = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE ...")]

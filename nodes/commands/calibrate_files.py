@@ -25,12 +25,10 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.camera.calibration import CalibrationError, Intrinsics
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-VIDEO_STEP_NS = 500_000_000
-"""between the images taken from a video: nearer ones show the same again"""
+VIDEO_STEP_NS = 500_000_000  # between the images taken from a video: nearer ones show the same again
 MAX_IMAGES = 60
 AXIS_PX = 4
-REACH_M = 6.0
-"""half the side of the grid that is drawn"""
+REACH_M = 6.0  # half the side of the grid that is drawn
 Image = NDArray[np.uint8]
 
 

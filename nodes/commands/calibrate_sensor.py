@@ -31,8 +31,7 @@ from steadypose.prior.timing.rate import FPS
 if TYPE_CHECKING:
     from steadypose.training.recipes.sensor_bias import HeldOut, SensorTake
 
-SHORTEST_S = 10.0
-"""Time in seconds that sensor and reference have in common, at least, in all recordings together."""
+SHORTEST_S = 10.0  # time in seconds that sensor and reference have in common, at least, in all recordings together
 FARTHEST_M, SHIFTS = 0.25, range(-15, 16)
 """Largest mean distance of a sensor's aligned joints from the reference's, metres; tried shifts, ticks of 30 Hz."""
 

@@ -60,8 +60,7 @@ def doctor(live: bool = False, launch: Annotated[str, tyro.conf.arg(metavar="FIL
     return 1 if bad else 0
 
 
-LISTEN_NS = 3_000_000_000
-"""Time in nanoseconds that a tracker is listened to."""
+LISTEN_NS = 3_000_000_000  # time in nanoseconds that a tracker is listened to
 
 
 def listen(launch_file: str, console: Console) -> int:

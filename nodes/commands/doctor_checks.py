@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from steadypose.msgs.types import PoseRaw
 
 
-PROJECT = PACKAGE.parents[1] / "pyproject.toml"
-"""of a checkout; an installed wheel has none"""
+PROJECT = PACKAGE.parents[1] / "pyproject.toml"  # of a checkout; an installed wheel has none
 INSTALL = install_command()
 
 
@@ -28,10 +27,8 @@ class Verdict(Enum):
     """The result of a check: the word that is printed, and its style."""
 
     GOOD = ("ok", "green")
-    NOTE = ("note", "yellow")
-    """works, but not as well as it could, or for want of something optional"""
-    BAD = ("missing", "bold red")
-    """`steadypose run` cannot work"""
+    NOTE = ("note", "yellow")  # works, but not as well as it could, or for want of something optional
+    BAD = ("missing", "bold red")  # `steadypose run` cannot work
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.body.skeleton import AVATAR_NAMES
 
 FORMATS = (".bvh", ".glb", ".vrma", ".csv", ".trc")
-NAMED = (".bvh", ".glb")
-"""those in which joints may have the names of another rig"""
+NAMED = (".bvh", ".glb")  # those in which joints may have the names of another rig
 
 
 def export(

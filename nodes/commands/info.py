@@ -26,8 +26,7 @@ from steadypose.nodes.sources.npz import is_output, read_arrays
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.prior.clean.settings import PriorSettings
 
-INFO_S = 2.0
-"""for which `info` listens to a topic that is published"""
+INFO_S = 2.0  # for which `info` listens to a topic that is published
 
 
 def info(

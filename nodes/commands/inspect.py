@@ -31,8 +31,7 @@ from steadypose.nodes.graph.topology import TransportSettings, publishers
 from steadypose.nodes.settings import STREAMS, LaunchError, located, printable
 from steadypose.prior.settings import nearest
 
-PATIENCE_S = 3.0
-"""without a message, after which a hint is printed"""
+PATIENCE_S = 3.0  # without a message, after which a hint is printed
 Topics = Annotated[tuple[str, ...], tyro.conf.arg(name="topic", metavar="TOPIC")]
 Count = Annotated[int | None, tyro.conf.arg(metavar="N")]
 LaunchFile = Annotated[str | None, tyro.conf.arg(metavar="FILE")]

@@ -25,10 +25,8 @@ from steadypose.nodes.settings import LaunchError, paths_in
 from steadypose.nodes.sinks.recorder import RecorderSettings
 
 MARK = "# made by `steadypose install-service`; `steadypose install-service --uninstall` removes it"
-HOMES = ("/home", "/root", "/run/user")
-"""what ``ProtectHome`` hides"""
-TEMPORARY = ("/tmp", "/var/tmp")
-"""what ``PrivateTmp`` hides"""
+HOMES = ("/home", "/root", "/run/user")  # what ``ProtectHome`` hides
+TEMPORARY = ("/tmp", "/var/tmp")  # what ``PrivateTmp`` hides
 UNIT = """\
 {mark}
 [Unit]
@@ -99,14 +97,10 @@ class Service:
 
     name: str
     user: str
-    is_new_user: bool
-    """whether the user is the service's own"""
-    command: Path
-    """the ``steadypose`` of an installation"""
-    launch: str
-    """a file, or the name of one of the project's own"""
-    groups: tuple[str, ...]
-    """besides the user's own, of those that this machine has"""
+    is_new_user: bool  # whether the user is the service's own
+    command: Path  # the ``steadypose`` of an installation
+    launch: str  # a file, or the name of one of the project's own
+    groups: tuple[str, ...]  # besides the user's own, of those that this machine has
 
     def unit(self) -> str:
         return UNIT.format(
@@ -158,10 +152,8 @@ def quoted(text: str) -> str:
 
 
 UNITS = Path("/etc/systemd/system")
-BOOTED = Path("/run/systemd/system")
-"""there where systemd runs this machine (sd_booted(3))"""
-Step = tuple[str, Callable[[], object]]
-"""One thing that is done: how it is printed, and a function that does it."""
+BOOTED = Path("/run/systemd/system")  # there where systemd runs this machine (sd_booted(3))
+Step = tuple[str, Callable[[], object]]  # one thing that is done: how it is printed, and a function that does it
 
 
 def _command(*words: str) -> Step:

@@ -33,8 +33,7 @@ from steadypose.prior.body.layouts import add_layouts
 In = Annotated[Path, tyro.conf.arg(name="in", metavar="IN")]
 Out = Annotated[Path, tyro.conf.arg(metavar="OUT")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
-ARRAY_FILES = (".npz", ".csv")
-"""endings of outputs that are one file of arrays"""
+ARRAY_FILES = (".npz", ".csv")  # endings of outputs that are one file of arrays
 UNTRUSTED = "the output cannot be trusted, because of the problems above"
 NO_POSE = "the output has no pose, because of the problems above"
 OTHER_FORMATS = {
@@ -183,22 +182,14 @@ def plural(count: int, one: str, more: str = "") -> str:
 class Cleaned:
     """Summary of the cleaning of one recording."""
 
-    frames: int
-    """of the input"""
-    duration_s: float
-    """of the input; steps of its stamps back do not count"""
-    spent_s: float
-    """computing time"""
-    poses: int
-    """number of poses in the output; 0 if no body was recognised, which is then a problem"""
-    refused: dict[str, int]
-    """what was refused or dropped, by cause"""
-    problems: list[str]
-    """what is wrong with the input, each as it was first found"""
-    trusted: bool
-    """whether the output can be trusted in spite of them"""
-    unread: dict[str, int]
-    """what of it the input holds and could not be read, because it is damaged"""
+    frames: int  # of the input
+    duration_s: float  # of the input; steps of its stamps back do not count
+    spent_s: float  # computing time
+    poses: int  # number of poses in the output; 0 if no body was recognised, which is then a problem
+    refused: dict[str, int]  # what was refused or dropped, by cause
+    problems: list[str]  # what is wrong with the input, each as it was first found
+    trusted: bool  # whether the output can be trusted in spite of them
+    unread: dict[str, int]  # what of it the input holds and could not be read, because it is damaged
 
 
 def clean_recording(

@@ -33,10 +33,8 @@ from steadypose.nodes.settings import STREAMS, located, printable
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 
-LINE_NS = 5_000_000_000
-"""between lines where there is no terminal for a table"""
-REPORT_NS = 1_000_000_000
-"""between writes of the health file"""
+LINE_NS = 5_000_000_000  # between lines where there is no terminal for a table
+REPORT_NS = 1_000_000_000  # between writes of the health file
 REPLAY = "replay"
 STALL_NS = 15_000_000_000
 """without progress after the source has ended, until the run is given up: a message was lost on the way"""

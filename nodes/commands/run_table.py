@@ -15,8 +15,7 @@ from steadypose.nodes.settings import printable
 
 LEAST = ("in", "queue", "MB", "delay\nms", "compute ms\np50/p99", "joints\ngated", "bodies", "frames")
 """columns that are left out where not all fit, in this order"""
-WIDTH = 80
-"""of `lines`, characters"""
+WIDTH = 80  # of `lines`, characters
 
 
 def table(

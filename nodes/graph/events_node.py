@@ -11,8 +11,7 @@ from steadypose.nodes.graph.launch import Launch
 from steadypose.nodes.graph.node import Node
 from steadypose.prior.events.detector import NOWHERE, EventDetector, EventSettings
 
-REPEAT_NS = 1_000_000_000
-"""Interval in stream time at which ongoing events are published again, nanoseconds."""
+REPEAT_NS = 1_000_000_000  # interval in stream time at which ongoing events are published again, nanoseconds
 
 
 class EventStream:

@@ -15,12 +15,9 @@ from steadypose.nodes.checks.problem import Problem, as_values, error
 from steadypose.nodes.graph.clock import FRAME_NS, Clock
 from steadypose.nodes.graph.topology import NODES
 
-REPORT_NS = 1_000_000_000
-"""Interval between reports, nanoseconds."""
-STALL_NS = 2_000_000_000
-"""Time of input without output after which a node counts as stalled, nanoseconds."""
-SAMPLES = 1000
-"""Number of latencies and compute times kept for the percentiles; half a minute at 30 Hz."""
+REPORT_NS = 1_000_000_000  # interval between reports, nanoseconds
+STALL_NS = 2_000_000_000  # time of input without output after which a node counts as stalled, nanoseconds
+SAMPLES = 1000  # number of latencies and compute times kept for the percentiles; half a minute at 30 Hz
 
 
 class Health:

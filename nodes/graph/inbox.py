@@ -13,10 +13,8 @@ from steadypose.msgs.transport import Subscriber
 from steadypose.msgs.types import Diagnostics, Message
 from steadypose.nodes.graph.clock import Clock
 
-READ_AHEAD = 64
-"""Largest number of messages that a node takes off a socket before it processes one."""
-LONGEST = 512
-"""Largest number of waiting messages of one publisher, over all its streams."""
+READ_AHEAD = 64  # largest number of messages that a node takes off a socket before it processes one
+LONGEST = 512  # largest number of waiting messages of one publisher, over all its streams
 DEADLINE_NS = 50_000_000
 """Longest time a frame waits in a node's queue while newer frames of its stream arrive, nanoseconds.
 
@@ -99,8 +97,7 @@ class Inbox:
 class _Received(NamedTuple):
     topic: str
     message: Message
-    since_ns: int
-    """lower bound of its arrival time, monotonic clock, nanoseconds"""
+    since_ns: int  # lower bound of its arrival time, monotonic clock, nanoseconds
 
 
 class _Queue:
@@ -167,18 +164,13 @@ def _source(message: Message) -> str:
     return "" if isinstance(message, Diagnostics) else message.source
 
 
-LOOK_NS = 500_000_000
-"""Interval between decisions, nanoseconds."""
-CALM_NS = 2_000_000_000
-"""Time without dropped frames before the limit is raised, nanoseconds."""
-SPARE = 0.65
-"""Largest predicted load (compute time per elapsed time) with more bodies, ratio."""
+LOOK_NS = 500_000_000  # interval between decisions, nanoseconds
+CALM_NS = 2_000_000_000  # time without dropped frames before the limit is raised, nanoseconds
+SPARE = 0.65  # largest predicted load (compute time per elapsed time) with more bodies, ratio
 MARGIN = 0.05
 """Margin of the load below `SPARE` at which one more body is tried, ratio. A message has a cost besides its bodies."""
-FEW = 0.05
-"""Tolerated share of dropped frames, ratio. For one stream this means none in half a second."""
-BUSY = 0.5
-"""Load above which fewer bodies help, ratio. Below it, other processes made the frames late."""
+FEW = 0.05  # tolerated share of dropped frames, ratio. For one stream this means none in half a second.
+BUSY = 0.5  # load above which fewer bodies help, ratio. Below it, other processes made the frames late.
 
 
 class BodyLimit:

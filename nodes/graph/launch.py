@@ -49,8 +49,7 @@ class _EveryLaunch:
     nodes: list[str] = field(default_factory=lambda: list(POSE_NODES))
     transport: TransportSettings = field(default_factory=TransportSettings)
     server: ServerSettings = field(default_factory=ServerSettings)
-    skeletons: dict[str, Any] = field(default_factory=dict)
-    """custom joint layouts (`prior.body.layouts`)"""
+    skeletons: dict[str, Any] = field(default_factory=dict)  # custom joint layouts (`prior.body.layouts`)
     plugins: dict[str, Any] = field(default_factory=dict)
     """nodes of other packages: node name to the ``module:name`` of its `NodeDeclaration`"""
 
@@ -228,8 +227,7 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     table[key] = value
 
 
-PIPELINES = ("prior", "trajectory", "events")
-"""Sections of what `clean` runs."""
+PIPELINES = ("prior", "trajectory", "events")  # sections of what `clean` runs
 _SECTIONS_OF_ALL = {
     "transport": "steadypose.nodes.graph.topology:TransportSettings",
     "server": "steadypose.nodes.graph.topology:ServerSettings",

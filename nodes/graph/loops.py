@@ -22,12 +22,9 @@ from typing import TextIO
 from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.prior import loop_cache
 
-COMPILED = {"prior", "trajectory"}
-"""Names of the nodes that need compiled loops."""
-WAIT_S = 600.0
-"""Longest time to wait for another process that compiles, seconds. That process may be suspended."""
-SAY_S = 5.0
-"""Interval between progress lines, seconds."""
+COMPILED = {"prior", "trajectory"}  # names of the nodes that need compiled loops
+WAIT_S = 600.0  # longest time to wait for another process that compiles, seconds. That process may be suspended.
+SAY_S = 5.0  # interval between progress lines, seconds
 _GARBAGE = 20_000
 """Garbage collector's threshold while compiling, objects. With Python's 700, collection takes a seventh of the time."""
 

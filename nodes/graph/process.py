@@ -33,10 +33,8 @@ def own_environment() -> dict[str, str]:
     return found | {"PYTHONSAFEPATH": "1"}
 
 
-_DONTNEED = 4
-"""``MADV_DONTNEED`` of madvise(2)"""
-_COMPILED = "STEADYPOSE_COMPILED"
-"""Name of the environment variable that marks a process restarted after compiling."""
+_DONTNEED = 4  # ``MADV_DONTNEED`` of madvise(2)
+_COMPILED = "STEADYPOSE_COMPILED"  # name of the environment variable that marks a process restarted after compiling
 _STARTS_WITH = 400_000
 """Garbage collector's threshold during start-up, objects. A start that compiles nothing creates fewer."""
 

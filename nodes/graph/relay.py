@@ -28,12 +28,10 @@ _FORM = struct.Struct("<qqqqqq")
 class Progress(NamedTuple):
     """What was published and acknowledged."""
 
-    publisher: int = 0
-    """the publisher's number"""
+    publisher: int = 0  # the publisher's number
     sequence: tuple[int, int] = (0, 0)
     """sequence number of the next message of the node's first topic, and of its second"""
-    mark: tuple[int, int] = (0, 0)
-    """the node's own note on the last message, `Node.mark`"""
+    mark: tuple[int, int] = (0, 0)  # the node's own note on the last message, `Node.mark`
 
 
 CONTEXT = 384
@@ -42,8 +40,7 @@ CONTEXT = 384
 This is longer than any window, any delay, and the time for which bone lengths are measured. Bones are then measured
 over other frames, so poses differ from those without a restart: in `walk_turn`, observed joints by 1.7 mm (median; 45
 mm in one of a thousand), hidden ones by 2.6 mm (67 mm). With 128 messages it is 2.6 mm (84 mm) and 3.4 mm (80 mm)."""
-BACK_NS = 1_000_000_000
-"""Backward step of stamps beyond which the stream counts as started anew, nanoseconds."""
+BACK_NS = 1_000_000_000  # backward step of stamps beyond which the stream counts as started anew, nanoseconds
 
 
 class Relay:

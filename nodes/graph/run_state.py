@@ -63,8 +63,7 @@ def _take(stack: ExitStack, path: str) -> str | None:
     return None
 
 
-LOSSES = ("dropped.", "refused.")
-"""Prefixes of the counts of messages that a node did not process."""
+LOSSES = ("dropped.", "refused.")  # prefixes of the counts of messages that a node did not process
 
 
 class Ledger:

@@ -14,20 +14,15 @@ from steadypose.nodes.graph.node import RUN, SUPERVISOR
 from steadypose.nodes.graph.process import own_command, own_environment
 from steadypose.nodes.graph.topology import NODES
 
-BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Pauses before successive restarts, seconds; the last one repeats."""
-STEADY_S = 10.0
-"""Uptime after which the pauses start from the first again, seconds."""
-TRIES = 6
-"""Number of successive crashes after which a node that has never reported counts as failed."""
+BACKOFF_S = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # pauses before successive restarts, seconds; the last one repeats
+STEADY_S = 10.0  # uptime after which the pauses start from the first again, seconds
+TRIES = 6  # number of successive crashes after which a node that has never reported counts as failed
 STARTING_S = 600.0
 """Longest time until a node's first report, seconds. The first start on a small machine compiles for minutes."""
 STALE_S = 3.0
 """Time without a report after which a node's last report is outdated, seconds. Nodes report once a second."""
-HUNG_S = 10.0
-"""Time without a report after which a node is killed and restarted, seconds."""
-STOP_S = 5.0
-"""Time between SIGTERM and SIGKILL, seconds."""
+HUNG_S = 10.0  # time without a report after which a node is killed and restarted, seconds
+STOP_S = 5.0  # time between SIGTERM and SIGKILL, seconds
 USAGE_ERROR = 2
 """Exit status of a node whose launch file cannot work. It is not restarted if it has never reported."""
 COMMAND = (*own_command("steadypose.nodes.cli:main"), "node")

@@ -15,8 +15,7 @@ from rosbags.typesys.store import Typestore
 
 from steadypose.msgs.codec import DEFINITIONS
 
-IDS_LIST = "std_msgs/Header header\nstring[] ids\n"
-"""Definition of hri_msgs/IdsList (REP-155)."""
+IDS_LIST = "std_msgs/Header header\nstring[] ids\n"  # definition of hri_msgs/IdsList (REP-155)
 
 
 @cache
@@ -77,10 +76,8 @@ def _zero(node: Any) -> Any:
     return [_zero(item) for _ in range(count)] if kind == Nodetype.ARRAY else []
 
 
-Publish = Callable[[bytes], None]
-"""Function that publishes a message, given as CDR."""
-DEPTH = 10
-"""Queue length for a late subscriber, messages."""
+Publish = Callable[[bytes], None]  # function that publishes a message, given as CDR
+DEPTH = 10  # queue length for a late subscriber, messages
 
 
 class Connection(Protocol):

@@ -22,8 +22,7 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import global_rotations, rotation_matrices
 from steadypose.prior.body.skeleton import PARENTS, VRM
 
-GONE_NS = 1_000_000_000
-"""Time of absence after which another person is followed, nanoseconds."""
+GONE_NS = 1_000_000_000  # time of absence after which another person is followed, nanoseconds
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,7 @@ class DatagramNode(Node):
         return {"written": str(self._sent)}
 
 
-BONES = tuple(name[0].upper() + name[1:] for name in VRM)
-"""(22,) names of the bones in the protocol and in Unity."""
+BONES = tuple(name[0].upper() + name[1:] for name in VRM)  # (22,) names of the bones in the protocol and in Unity
 _A_BUNDLE = 11  # messages per datagram, so that datagrams are not fragmented
 
 

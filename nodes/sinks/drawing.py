@@ -26,8 +26,7 @@ LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR = "#0072b2", "#d55e00", "#3c3c3c"
 """Colours of a body's sides on white."""
 DARK, ON_DARK = "#12141a", ("#56b4e9", "#f08c2e", "#d7dbe4")
 """Colours of a dark background, and of left, right and middle on it."""
-FAINT = 0.3
-"""Opacity of unobserved joints and bones."""
+FAINT = 0.3  # opacity of unobserved joints and bones
 CONTACT_INDICES: NDArray[np.intp] = np.array([J[name] for name in CONTACTS])
 """(8,) canonical joints of the contact probabilities in ``pose/world``."""
 

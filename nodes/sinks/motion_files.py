@@ -35,16 +35,11 @@ class ExportError(ValueError):
 class BodyMotion:
     """A body's motion at a constant frame rate."""
 
-    fps: float
-    """frame rate, Hz"""
-    root: Floats
-    """(T, 3) metres, world, z up: the pelvis"""
-    rotations: Floats
-    """(T, 22, 4) xyzw, local; the pelvis' to the world"""
-    offsets: Floats
-    """(22, 3) metres, each joint in its parent's frame"""
-    start_s: float = 0.0
-    """stamp of the first frame, seconds"""
+    fps: float  # frame rate, Hz
+    root: Floats  # (T, 3) metres, world, z up: the pelvis
+    rotations: Floats  # (T, 22, 4) xyzw, local; the pelvis' to the world
+    offsets: Floats  # (22, 3) metres, each joint in its parent's frame
+    start_s: float = 0.0  # stamp of the first frame, seconds
 
     def ahead(self) -> BodyMotion:
         """The motion with its world turned for animation programs (`drawing.ahead`)."""
@@ -100,8 +95,7 @@ COMMON_HZ = (10.0, 12.0, 12.5, 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 7
 """Frame rates of cameras and motion capture, Hz."""
 VIDEO_HZ = (23.976, 29.97, 59.94, 119.88)
 """Frame rates of video, Hz, which jitter alone does not tell from the common ones."""
-SAME = 0.01
-"""Largest deviation from a common rate that counts as rounding or jitter, ratio."""
+SAME = 0.01  # largest deviation from a common rate that counts as rounding or jitter, ratio
 ROUNDED = 1e-4
 """Largest one by which a file's frame time is rounded, such as 0.008333 s: frames then are the input's own."""
 

@@ -34,10 +34,8 @@ logger = logging.getLogger(__name__)
 
 LEAST_FREE_MB = 1.0
 """Smallest free disk space in which messages are written: a part's header may fit where its messages do not."""
-CHECK_NS = 1_000_000_000
-"""Interval between checks of the free disk space, nanoseconds."""
-QUIET_S = 0.3
-"""Time without a message after which everything in flight has arrived, when the node stops, seconds."""
+CHECK_NS = 1_000_000_000  # interval between checks of the free disk space, nanoseconds
+QUIET_S = 0.3  # time without a message after which everything in flight has arrived, when the node stops, seconds
 LAST_NS = 2_000_000_000
 """Longest time that a stopping node goes on recording publishers that do not stop, such as a tracker, nanoseconds."""
 WAITING = 1000
@@ -119,8 +117,7 @@ def _is_recording(directory: Path) -> bool:
     return True
 
 
-AHEAD_NS = 10_000_000_000
-"""Jump ahead of a topic's stamps of which a single one counts as wrong, nanoseconds."""
+AHEAD_NS = 10_000_000_000  # jump ahead of a topic's stamps of which a single one counts as wrong, nanoseconds
 
 
 class LogTimes:

@@ -94,8 +94,7 @@ class RetargetNode(DatagramNode):
 
 
 SIDES = ("left", "right")
-ANKLE = 0.07
-"""Height of a person's ankle above the floor when standing, metres."""
+ANKLE = 0.07  # height of a person's ankle above the floor when standing, metres
 CROUCH = 0.98
 """Height of the standing robot's hips relative to its legs' length, ratio. It is below 1 because straight knees are
 singular."""
@@ -107,20 +106,16 @@ _BONES = np.array(
     ]
 ).T
 """(2, 6) first and last joints of thigh, upper arm and forearm, left and right."""
-EASE_S = 1.0
-"""Time to ease into following a person, and to come to rest, seconds."""
+EASE_S = 1.0  # time to ease into following a person, and to come to rest, seconds
 
 
 class RobotPose(NamedTuple):
     """A robot's pose at one time."""
 
     stamp_ns: int
-    root: Floats
-    """(7,) pose of the root link in the world: metres and xyzw"""
-    joints: Floats
-    """(N,) radians or metres, in the order of `Robot.joints`"""
-    stands: tuple[bool, bool]
-    """whether the left and the right foot have landed and are held in place"""
+    root: Floats  # (7,) pose of the root link in the world: metres and xyzw
+    joints: Floats  # (N,) radians or metres, in the order of `Robot.joints`
+    stands: tuple[bool, bool]  # whether the left and the right foot have landed and are held in place
 
 
 class Retargeter:

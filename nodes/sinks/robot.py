@@ -47,18 +47,12 @@ PARTS = ("pelvis", "torso", *(f"{side}_{part}" for side in _SIDES for part in _P
 class Robot:
     """A humanoid robot."""
 
-    model: mujoco.MjModel
-    """MuJoCo's model, with a free joint under the root link"""
-    joints: tuple[str, ...]
-    """(N,) names of the moving joints, in the model's order"""
-    lower: NDArray[np.float64]
-    """(N,) lower limits from the URDF, radians or metres"""
-    upper: NDArray[np.float64]
-    """(N,) upper limits from the URDF, radians or metres"""
-    speed: NDArray[np.float64]
-    """(N,) largest speeds, rad/s or m/s"""
-    links: Mapping[str, str]
-    """link of each part in `PARTS`"""
+    model: mujoco.MjModel  # MuJoCo's model, with a free joint under the root link
+    joints: tuple[str, ...]  # (N,) names of the moving joints, in the model's order
+    lower: NDArray[np.float64]  # (N,) lower limits from the URDF, radians or metres
+    upper: NDArray[np.float64]  # (N,) upper limits from the URDF, radians or metres
+    speed: NDArray[np.float64]  # (N,) largest speeds, rad/s or m/s
+    links: Mapping[str, str]  # link of each part in `PARTS`
 
 
 def load_robot(path: Path, links: Mapping[str, str]) -> Robot:

@@ -10,17 +10,14 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import yaw_matrix
 from steadypose.prior.sim.gait import minimum_jerk
 
-STANDS, LIFTS = 0.6, 0.4
-"""Contact probabilities above which a foot stands, and below which it lifts."""
+STANDS, LIFTS = 0.6, 0.4  # contact probabilities above which a foot stands, and below which it lifts
 LAND_S, RELEASE_S = 0.1, 0.15
 """Times in which a landing foot comes down flat, and a lifting foot moves to the person's, seconds."""
 LANDED = 0.01
 """Distance from where it is to stand within which a foot has landed and is published as standing, metres. A person's
 contact probability rises before the robot's foot, of other proportions, is on the floor."""
-TOO_FAR = 0.3
-"""Distance between a standing foot and its target at which it is released anyway, metres."""
-TURNED = 1.0
-"""Angle between a standing foot's heading and the person's at which it is released anyway, radians."""
+TOO_FAR = 0.3  # distance between a standing foot and its target at which it is released anyway, metres
+TURNED = 1.0  # angle between a standing foot's heading and the person's at which it is released anyway, radians
 FREE, HELD = (5.0, 0.5), (100.0, 10.0)
 """Costs of a metre and of a radian of error, of a free and of a held foot. A free foot whose target is out of reach
 must not tear off the other."""
@@ -29,12 +26,9 @@ must not tear off the other."""
 class Target(NamedTuple):
     """Where a foot should be."""
 
-    turn: Floats
-    """(3, 3) rotation of the link, world"""
-    place: Floats
-    """(3,) position of the link, world, metres"""
-    costs: tuple[float, float]
-    """costs of a metre and of a radian of error"""
+    turn: Floats  # (3, 3) rotation of the link, world
+    place: Floats  # (3,) position of the link, world, metres
+    costs: tuple[float, float]  # costs of a metre and of a radian of error
 
 
 class Foot:

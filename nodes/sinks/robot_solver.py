@@ -17,23 +17,18 @@ import numpy as np
 from steadypose.nodes.sinks.robot import Robot
 from steadypose.prior.arrays import Floats
 
-MARGIN = 1e-4
-"""Distance kept between a joint and its limit against rounding, radians or metres."""
-ROOT_M_S, ROOT_RAD_S = 4.0, 4.0
-"""Largest speeds of the root link along and about each axis."""
-POSTURE = 0.02
-"""Cost of a radian away from the home pose."""
+MARGIN = 1e-4  # distance kept between a joint and its limit against rounding, radians or metres
+ROOT_M_S, ROOT_RAD_S = 4.0, 4.0  # largest speeds of the root link along and about each axis
+POSTURE = 0.02  # cost of a radian away from the home pose
 SMOOTH, LEG_SMOOTH, ROOT_SMOOTH = 0.1, 0.5, 1.0
 """Costs of a radian (of the root also of a metre) by which a step differs from the last one. Legs near their limits
 and the root would leap, because a linear program does not know what a large step does."""
-DAMPING = 1e-4
-"""Regularisation of the program."""
+DAMPING = 1e-4  # regularisation of the program
 SLIP, ROUNDS, HALVED = 0.004, 3, 3
 """Distance in metres by which a held foot may get farther from its target, or a free one deeper below the floor, in one
 frame; how often the program is solved around its last solution until that holds, and how often the step is then halved.
 A step of the root of centimetres turns legs so far that the program, which is linear, would let feet slip."""
-FEET = ("left_foot", "right_foot")
-"""Parts that stay above the floor."""
+FEET = ("left_foot", "right_foot")  # parts that stay above the floor
 
 
 class Solver:

@@ -13,8 +13,7 @@ import socket
 from collections.abc import Collection
 from urllib.parse import urlsplit
 
-LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Host names that only this machine can reach."""
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")  # host names that only this machine can reach
 
 
 def own_names(host: str, *others: str) -> frozenset[str]:

@@ -19,12 +19,9 @@ from steadypose.prior.arrays import Floats
 from steadypose.prior.body.layouts import AZURE_KINECT32, BLAZEPOSE33, COCO17, ZED38, Skeleton
 from steadypose.prior.body.skeleton import finite_joints
 
-ZED_BODY_38 = 2
-"""Value of ``body_format`` in ZED's ROS message for the skeleton of 38 key points."""
-AZURE_IDS = 100
-"""Factor of the body in the driver's marker ids: id = body · 100 + joint."""
-MIN_POINTS = 6
-"""Smallest number of image landmarks that determine a body's position."""
+ZED_BODY_38 = 2  # value of ``body_format`` in ZED's ROS message for the skeleton of 38 key points
+AZURE_IDS = 100  # factor of the body in the driver's marker ids: id = body · 100 + joint
+MIN_POINTS = 6  # smallest number of image landmarks that determine a body's position
 
 
 def from_mediapipe(

@@ -144,10 +144,8 @@ def open_webcam(settings: WebcamSettings, context: SourceContext) -> CameraSourc
     return VideoSource(settings, context.calibration, image_file=context.image_file)  # pyright: ignore[reportArgumentType]
 
 
-LATE_S = 1.0
-"""Age beyond which a camera's skeletons are not merged, seconds."""
-ENOUGH = 10
-"""Smallest number of a camera's frames to judge by."""
+LATE_S = 1.0  # age beyond which a camera's skeletons are not merged, seconds
+ENOUGH = 10  # smallest number of a camera's frames to judge by
 
 
 @dataclass(frozen=True)

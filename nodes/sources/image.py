@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from steadypose.prior.arrays import Floats
 
-NAME = "image"
-"""Name of the file in the directory of the sockets."""
+NAME = "image"  # name of the file in the directory of the sockets
 PERIOD_NS = 66_000_000
 """Shortest interval between images, nanoseconds. Half of a camera's frames are enough for viewing."""
-WIDTH = 480
-"""Largest width of a stored image, pixels."""
+WIDTH = 480  # largest width of a stored image, pixels
 _HEAD = struct.Struct("<q2I4d")
 
 
@@ -28,10 +26,8 @@ class CameraImage(NamedTuple):
     """An image, and the intrinsics that project points in the camera's optical frame into it."""
 
     stamp_ns: int
-    size: tuple[int, int]
-    """width and height in pixels"""
-    intrinsics: Floats
-    """(3, 3) pixels"""
+    size: tuple[int, int]  # width and height in pixels
+    intrinsics: Floats  # (3, 3) pixels
     jpeg: bytes
 
 

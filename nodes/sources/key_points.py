@@ -25,16 +25,13 @@ from steadypose.prior.body.layouts import SKELETONS
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS
 from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
-HIGHEST = 100.0
-"""Largest height of a camera above the floor, metres."""
-LONGEST_GAP_NS = 200_000_000
-"""Longest gap over which key points are interpolated, nanoseconds."""
+HIGHEST = 100.0  # largest height of a camera above the floor, metres
+LONGEST_GAP_NS = 200_000_000  # longest gap over which key points are interpolated, nanoseconds
 LONGEST_NS = 24 * 3600 * 10**9
 """Longest duration of a recording, nanoseconds. It prevents a single wrong stamp from creating a grid of years."""
 NORMALISED = 2.0
 """Largest coordinate of key points that are not pixels; those of a normalised image may lie a little outside of it."""
-MOSTLY = 0.95
-"""Share of frames with shoulders below hips from which on the image's y axis is probably the other."""
+MOSTLY = 0.95  # share of frames with shoulders below hips from which on the image's y axis is probably the other
 _NUMBERS = {"keypoints", "confidence", "focal", "centre", "camera_height", "points"}
 
 

@@ -31,8 +31,7 @@ from steadypose.prior.npz import check_arrays
 
 logger = logging.getLogger(__name__)
 
-CLEANED = ("world_positions", "state")
-"""Names of arrays that an output has and an input lacks."""
+CLEANED = ("world_positions", "state")  # names of arrays that an output has and an input lacks
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -54,8 +53,7 @@ def as_input(arrays: Arrays) -> Arrays:
     return kept | {"positions": positions, "skeleton": np.array(CANONICAL.name), "up": np.array("z")}
 
 
-STAMPS_END_NS = 2**31 * 10**9
-"""Upper bound of stamps, nanoseconds. ROS 2 stores seconds in an int32."""
+STAMPS_END_NS = 2**31 * 10**9  # upper bound of stamps, nanoseconds. ROS 2 stores seconds in an int32.
 _ARRAYS = ("positions", "skeleton", "stamp_ns", "fps", "confidence", "up", "body_id")
 _OPTIONAL = {"confidence", "up", "body_id"}
 

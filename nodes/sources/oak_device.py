@@ -42,12 +42,9 @@ SYNC_THRESHOLD = timedelta(seconds=0.5 / DEPTH_FPS)
 """Largest difference between the stamps of paired colour and depth images. Their sensors are not synchronised."""
 IMU_HZ = 100
 MAX_BODIES = 8
-QUEUE = 4
-"""Largest number of frames queued when the node is late; beyond it the oldest is dropped."""
-TIMEOUT_S = 5.0
-"""Time without a frame after which the camera is closed and reopened, seconds."""
-STARTUP_TIMEOUT_S = 30.0
-"""Time without a first frame after which the camera is closed and reopened, seconds."""
+QUEUE = 4  # largest number of frames queued when the node is late; beyond it the oldest is dropped
+TIMEOUT_S = 5.0  # time without a frame after which the camera is closed and reopened, seconds
+STARTUP_TIMEOUT_S = 30.0  # time without a first frame after which the camera is closed and reopened, seconds
 
 
 def _nanoseconds(time: timedelta) -> int:
@@ -284,24 +281,18 @@ def accelerometer(pipeline: dai.Pipeline, device: dai.Device) -> tuple[dai.Node.
     return imu.out, turn
 
 
-SETTLE_PAIRS = 30
-"""Number of pairs skipped while exposure and the direction of gravity settle."""
-PAIR_TIMEOUT_S = 20.0
-"""Longest time to wait for a pair, seconds."""
-READING_TIMEOUT_S = 1.0
-"""Longest time to wait for the accelerometer after the image, seconds."""
+SETTLE_PAIRS = 30  # number of pairs skipped while exposure and the direction of gravity settle
+PAIR_TIMEOUT_S = 20.0  # longest time to wait for a pair, seconds
+READING_TIMEOUT_S = 1.0  # longest time to wait for the accelerometer after the image, seconds
 
 
 @dataclass(frozen=True)
 class Still:
     """A still image of a camera, with depth."""
 
-    colour: NDArray[np.uint8]
-    """(H, W, 3) BGR, undistorted"""
-    depth: NDArray[np.uint16]
-    """(H, W) millimetres, in the view of ``colour``; 0 in holes"""
-    intrinsics: NDArray[np.float64]
-    """(3, 3) of both"""
+    colour: NDArray[np.uint8]  # (H, W, 3) BGR, undistorted
+    depth: NDArray[np.uint16]  # (H, W) millimetres, in the view of ``colour``; 0 in holes
+    intrinsics: NDArray[np.float64]  # (3, 3) of both
     up: NDArray[np.float64] | None
     """(3,) direction of up measured by the IMU, optical frame; None without a calibrated IMU"""
 

@@ -27,10 +27,8 @@ LOOP_PAUSE_NS = 1_000_000_000
 class Position(NamedTuple):
     """The playback position in a recording."""
 
-    loops_ns: int = 0
-    """offset of stamps against the recording from earlier loops, nanoseconds"""
-    messages: int = 0
-    """number of messages published in this loop"""
+    loops_ns: int = 0  # offset of stamps against the recording from earlier loops, nanoseconds
+    messages: int = 0  # number of messages published in this loop
 
 
 class _Played(NamedTuple):

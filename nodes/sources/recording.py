@@ -38,8 +38,7 @@ _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 """File name suffixes of videos, in which MediaPipe detects skeletons."""
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
-DAMAGE = (LOST, BROKEN, UNDECODABLE)
-"""Prefixes of the causes that count unreadable parts of a recording."""
+DAMAGE = (LOST, BROKEN, UNDECODABLE)  # prefixes of the causes that count unreadable parts of a recording
 
 
 class RecordingSource:
@@ -117,13 +116,11 @@ def end_of(last: PoseRaw) -> PoseRaw:
 
 
 AXES = ("x", "y", "z")
-LATEST_S = 2.0**31
-"""Upper bound of a stamp, seconds. ROS 2 stores seconds in an int32."""
+LATEST_S = 2.0**31  # upper bound of a stamp, seconds. ROS 2 stores seconds in an int32.
 UNITS = {"milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
 MISSING = frozenset({"", "nan", "null", "none", "n/a", "na", "#n/a", "-"})
 """What a cell without a number may contain, in small letters."""
-NOTES = ("skeleton", "up")
-"""Keys of the lines ``# KEY: VALUE``."""
+NOTES = ("skeleton", "up")  # keys of the lines ``# KEY: VALUE``
 
 
 class CsvError(ValueError):

@@ -30,8 +30,7 @@ from steadypose.prior.settings import nearest
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-CACHE_NS = 10_000_000_000
-"""Time for which transforms are kept, nanoseconds; the same as in tf2."""
+CACHE_NS = 10_000_000_000  # time for which transforms are kept, nanoseconds; the same as in tf2
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 Moment = tuple[int, Floats, Floats]
 """Stamp in nanoseconds, translation (3,) metres and quaternion (4,) xyzw, from the child's frame to the parent's."""

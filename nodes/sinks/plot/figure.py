@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
     from steadypose.prior.complete.stream import Completion
 
-STRIP, TITLE = 2.8, 0.45
-"""Heights of the strip of stick figures and of a panel's title, inches."""
+STRIP, TITLE = 2.8, 0.45  # heights of the strip of stick figures and of a panel's title, inches
 IMAGES = (".png", ".svg", ".pdf")
 
 

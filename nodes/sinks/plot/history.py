@@ -28,24 +28,15 @@ _NONE = np.zeros(0)
 class Track(NamedTuple):
     """One body on one topic, one row per message. Positions are in the world."""
 
-    time: NDArray[np.float64]
-    """(T,) seconds since the recording's first stamp"""
-    positions: NDArray[np.float64]
-    """(T, 22, 3) metres; NaN where unobserved"""
-    raw: NDArray[np.float64]
-    """(T, 22, 3) metres, the input joints; empty except on `pose/clean`"""
-    state: NDArray[np.uint8]
-    """(T, 22) `JointState`"""
-    sigma: NDArray[np.float64]
-    """(T, 22) metres"""
-    anomaly: NDArray[np.float64]
-    """(T,)"""
-    flag: NDArray[np.bool_]
-    """(T,)"""
-    contacts: NDArray[np.float64]
-    """(T, 8)"""
-    tracking: NDArray[np.uint8]
-    """(T,) `Tracking`"""
+    time: NDArray[np.float64]  # (T,) seconds since the recording's first stamp
+    positions: NDArray[np.float64]  # (T, 22, 3) metres; NaN where unobserved
+    raw: NDArray[np.float64]  # (T, 22, 3) metres, the input joints; empty except on `pose/clean`
+    state: NDArray[np.uint8]  # (T, 22) `JointState`
+    sigma: NDArray[np.float64]  # (T, 22) metres
+    anomaly: NDArray[np.float64]  # (T,)
+    flag: NDArray[np.bool_]  # (T,)
+    contacts: NDArray[np.float64]  # (T, 8)
+    tracking: NDArray[np.uint8]  # (T,) `Tracking`
 
 
 @dataclass
@@ -55,16 +46,12 @@ class History:
     name: str
     stamps: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     """stamps by topic: (T,) seconds since the recording's first stamp"""
-    tracks: dict[str, dict[int, Track]] = field(default_factory=dict)
-    """tracks by topic and body"""
-    calibrated: bool = True
-    """whether the camera's position in the world is known"""
-    reported: bool = False
-    """whether diagnostics were recorded"""
+    tracks: dict[str, dict[int, Track]] = field(default_factory=dict)  # tracks by topic and body
+    calibrated: bool = True  # whether the camera's position in the world is known
+    reported: bool = False  # whether diagnostics were recorded
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.ones(len(JOINTS), bool))
     """(22,) whether the sensor's layout has each joint"""
-    origin: str = ""
-    """sources and skeletons, for the title"""
+    origin: str = ""  # sources and skeletons, for the title
     sensor: dict[str, list[float]] = field(default_factory=dict)
     """sensor noise estimated by the prior, each second: ``jitter_mm`` and ``slow_error_mm``"""
     dropped_or_refused: Counter[str] = field(default_factory=Counter)
@@ -184,19 +171,15 @@ def _rows(message: PoseRaw | PoseClean | PoseWorld, time: float) -> Iterable[tup
             yield body.id, (time, body.positions, _NONE, body.state, body.sigma, np.nan, False, *of_world)
 
 
-MAX_TRUTH_GAP_S = 0.05
-"""Largest time between a pose and the ground truth it is compared with, seconds."""
+MAX_TRUTH_GAP_S = 0.05  # largest time between a pose and the ground truth it is compared with, seconds
 
 
 class TrackError(NamedTuple):
     """Error of a track against the ground truth."""
 
-    time: NDArray[np.float64]
-    """(T,) seconds"""
-    mean: NDArray[np.float64]
-    """(T,) metres, mean over the joints present"""
-    by_joint: NDArray[np.float64]
-    """(22,) metres, mean over time"""
+    time: NDArray[np.float64]  # (T,) seconds
+    mean: NDArray[np.float64]  # (T,) metres, mean over the joints present
+    by_joint: NDArray[np.float64]  # (22,) metres, mean over time
 
 
 def errors_of(history: History, body: int) -> dict[str, TrackError]:

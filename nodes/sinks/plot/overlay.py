@@ -21,25 +21,19 @@ from steadypose.nodes.sources.source import WebcamSettings
 from steadypose.nodes.sources.webcam_device import stamped_images
 from steadypose.prior.arrays import Floats
 
-FPS = 15
-"""Largest frame rate of the written video, Hz."""
-WIDTH = 480
-"""Largest width of one of its panels, pixels."""
+FPS = 15  # largest frame rate of the written video, Hz
+WIDTH = 480  # largest width of one of its panels, pixels
 APART_NS = 34_000_000
 """Largest time between an image and the pose drawn over it, nanoseconds; one frame of the prior's grid."""
-NEAREST = 0.1
-"""Smallest depth at which a joint is drawn, metres. A nearer joint projects far outside the image."""
+NEAREST = 0.1  # smallest depth at which a joint is drawn, metres. A nearer joint projects far outside the image.
 
 
 class Body(NamedTuple):
     """One body at one time, in the camera's optical frame."""
 
-    raw: Floats | None
-    """(22, 3) metres, the input joints; None if they were not stored"""
-    clean: Floats
-    """(22, 3) metres"""
-    observed: NDArray[np.bool_]
-    """(22,)"""
+    raw: Floats | None  # (22, 3) metres, the input joints; None if they were not stored
+    clean: Floats  # (22, 3) metres
+    observed: NDArray[np.bool_]  # (22,)
 
 
 def overlaid(recording: Path, video: Path, body: int | None) -> tuple[Iterator[NDArray[np.uint8]], float]:

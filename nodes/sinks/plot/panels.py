@@ -31,8 +31,7 @@ from steadypose.prior.body.skeleton import J
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-GAP_S = 0.2
-"""Longest gap that a plotted line bridges, seconds."""
+GAP_S = 0.2  # longest gap that a plotted line bridges, seconds
 JOINTS_SHOWN = 3
 TOPIC_COLOURS = {POSE_TRUTH: TRUTH_COLOUR, POSE_RAW: RAW_COLOUR, POSE_CLEAN: CLEAN_COLOUR, POSE_WORLD: WORLD_COLOUR}
 AXIS_COLOURS = {"x": "#882255", "y": "#44aa99", "z": "#332288"}
@@ -193,8 +192,7 @@ def _draw_intervals(ax: Axes, history: History) -> None:
     ax.minorticks_off()
 
 
-GAP_RATIO = 1.5
-"""Interval between frames, relative to the median, above which it counts as a gap, ratio."""
+GAP_RATIO = 1.5  # interval between frames, relative to the median, above which it counts as a gap, ratio
 FIGURES = 12
 CONTACT_PROBABILITY = 0.5
 

@@ -36,20 +36,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 VIDEOS = (".gif", ".mp4")
-FPS = 15
-"""Frame rate of the video, Hz. Half of the poses' rate is smooth enough."""
+FPS = 15  # frame rate of the video, Hz. Half of the poses' rate is smooth enough.
 PANEL_INCHES, STAGE_WIDTH, DPI = (2.3, 3.4), 1.6, 80
 """Size of a panel in inches; relative width of the world's panel; resolution in dots per inch."""
 GHOST, FLOOR = "#cfcfcf", "#e6e6e6"
 SIDE_COLOURS = (LEFT_COLOUR, RIGHT_COLOUR, MIDDLE_COLOUR)
-ELEVATION = 0.22
-"""Angle by which the view looks down, radians."""
-TURNED = 0.5
-"""Angle by which the view is rotated from the front, radians."""
-TALL = 1.8
-"""Height of the space shown above the floor, metres."""
-PATH_FRAMES = 150
-"""Length of the drawn path over the floor, frames."""
+ELEVATION = 0.22  # angle by which the view looks down, radians
+TURNED = 0.5  # angle by which the view is rotated from the front, radians
+TALL = 1.8  # height of the space shown above the floor, metres
+PATH_FRAMES = 150  # length of the drawn path over the floor, frames
 SHADES = (1.0, 0.8, 0.6, 0.45, 0.3, 0.15)
 """Opacities on white of each colour in a GIF's palette. They are few, and the same in all frames, to avoid flicker."""
 

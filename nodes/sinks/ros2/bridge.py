@@ -27,10 +27,8 @@ if TYPE_CHECKING:
     from steadypose.nodes.sinks.ros2.messages import BodyTopics
 
 RVIZ, LAYOUT = PACKAGE / "launch/views/steadypose.rviz", PACKAGE / "launch/views/foxglove.json"
-GLOBAL = ("tf", "tf_static", "clock", "diagnostics")
-"""Topics outside any namespace, by ROS's convention."""
-SILENT_NS = 5_000_000_000
-"""Time without a message after which the bodies of a source are removed, nanoseconds."""
+GLOBAL = ("tf", "tf_static", "clock", "diagnostics")  # topics outside any namespace, by ROS's convention
+SILENT_NS = 5_000_000_000  # time without a message after which the bodies of a source are removed, nanoseconds
 HOST = "127.0.0.1"
 """Address to serve at: this machine only, because poses are personal data. From another machine, use
 ``ssh -L 8765:localhost:8765 robot``."""

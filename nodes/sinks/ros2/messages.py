@@ -30,12 +30,9 @@ from steadypose.prior.body.skeleton import J
 from steadypose.prior.models.posture import RootCovariance
 
 MARKER_LIFE_S = 0.5
-JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12
-"""Sizes of markers, metres."""
-SPHERE_LIST, LINE_LIST, TEXT_VIEW_FACING, ARROW = 7, 5, 9, 0
-"""Marker types of ``visualization_msgs/Marker``."""
-UNKNOWN_VARIANCE = 1e6
-"""Variance of unobserved components of an odometry, m², rad², m²/s² or rad²/s²."""
+JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12  # sizes of markers, metres
+SPHERE_LIST, LINE_LIST, TEXT_VIEW_FACING, ARROW = 7, 5, 9, 0  # marker types of ``visualization_msgs/Marker``
+UNKNOWN_VARIANCE = 1e6  # variance of unobserved components of an odometry, m², rad², m²/s² or rad²/s²
 
 
 def _colour(r: float, g: float, b: float, a: float = 1.0) -> Any:
@@ -185,12 +182,10 @@ def names_of(world: PoseWorld, source: str) -> tuple[dict[str, WorldBody], int]:
 
 MARKERS, POSES, BODIES = "steadypose/markers", "steadypose/poses", "humans/bodies"
 OWN_TOPICS = {PoseRaw: "pose_raw", PoseClean: "pose_clean", PoseWorld: "pose_world", PoseEvents: "pose_events"}
-GROWN = 0.02
-"""Change of a link's mean length at which the body's URDF is published again, metres."""
+GROWN = 0.02  # change of a link's mean length at which the body's URDF is published again, metres
 MEAN_OF = 300
 """Number of frames over which links' lengths are averaged. Single frames' lengths differ by centimetres."""
-OF_BODY = ("joint_states", "odom", "urdf")
-"""Topics of each body."""
+OF_BODY = ("joint_states", "odom", "urdf")  # topics of each body
 
 
 class Output(Protocol):

@@ -31,12 +31,9 @@ Links = Mapping[str, tuple[Floats, Floats]]
 class Link(NamedTuple):
     """A link of REP-155 and its counterpart in the canonical skeleton."""
 
-    origin: int
-    """joint at which it begins"""
-    turned_by: int
-    """joint whose rotation it has"""
-    rest: Floats
-    """(3, 3) rotation in the T pose of the canonical skeleton"""
+    origin: int  # joint at which it begins
+    turned_by: int  # joint whose rotation it has
+    rest: Floats  # (3, 3) rotation in the T pose of the canonical skeleton
 
 
 def _links() -> dict[str, Link]:
@@ -59,8 +56,7 @@ def _links() -> dict[str, Link]:
     return links
 
 
-LINKS: Mapping[str, Link] = _links()
-"""Links by name, without the body's id; ``body`` is the root."""
+LINKS: Mapping[str, Link] = _links()  # links by name, without the body's id; ``body`` is the root
 JOINTS: tuple[str, ...] = (
     "waist", "r_head", "y_head", "p_head",
     *(f"{side}_{joint}" for side in "lr" for joint in ("y_shoulder", "p_shoulder", "r_shoulder", "elbow")),
@@ -207,8 +203,7 @@ _BONES: Mapping[str, tuple[str, ...]] = {
     "l_hip": ("*_knee",), "r_hip": ("*_knee",), "l_knee": ("*_ankle",), "r_knee": ("*_ankle",),
 }  # fmt: skip
 """Links to whose origins a cylinder is drawn from each link's origin; ``*`` is the side."""
-BONE_RADIUS = 0.03
-"""Radius of a drawn bone, metres."""
+BONE_RADIUS = 0.03  # radius of a drawn bone, metres
 
 
 def _draw(link: ElementTree.Element, end: Floats) -> None:

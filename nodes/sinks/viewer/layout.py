@@ -32,8 +32,7 @@ def _rgb(colour: str) -> list[int]:
 
 
 DARK_RGB = _rgb(DARK)
-SIDE_RGB = np.array([_rgb(colour) for colour in ON_DARK], np.uint8)
-"""(3, 3) colours of left, right and middle."""
+SIDE_RGB = np.array([_rgb(colour) for colour in ON_DARK], np.uint8)  # (3, 3) colours of left, right and middle
 FAINT_RGB = (FAINT * SIDE_RGB + (1.0 - FAINT) * np.array(DARK_RGB)).astype(np.uint8)
 """(3, 3) colours of unobserved joints and bones, blended with the background because Rerun's lines have no opacity."""
 STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.uint8)
@@ -53,10 +52,8 @@ LEGEND = """
 class Eye(NamedTuple):
     """The initial viewpoint of a scene."""
 
-    target: NDArray[np.float64]
-    """(3,) metres, world: the middle of the bodies"""
-    front: NDArray[np.float64]
-    """(3,) unit vector, world: direction in which one of them faces"""
+    target: NDArray[np.float64]  # (3,) metres, world: the middle of the bodies
+    front: NDArray[np.float64]  # (3,) unit vector, world: direction in which one of them faces
 
 
 def name_series(recording: rr.RecordingStream) -> None:

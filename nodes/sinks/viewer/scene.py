@@ -46,20 +46,14 @@ if TYPE_CHECKING:
 
     from steadypose.nodes.sources.image import CameraImage
 
-PATH_SECONDS = 10.0
-"""Length of the drawn path of a body over the floor, seconds."""
-CONTACT_PROBABILITY = 0.5
-"""Contact probability above which a contact is drawn."""
+PATH_SECONDS = 10.0  # length of the drawn path of a body over the floor, seconds
+CONTACT_PROBABILITY = 0.5  # contact probability above which a contact is drawn
 FOLLOW_SHARE = 0.1
 """Gain per message with which the viewpoint follows the bodies. It is low, so that raw poses do not shake the view."""
-FOLLOW_STEP = 0.1
-"""Largest step of the viewpoint per message along an axis, metres."""
-BELOW_TRUNK = 0.25
-"""Distance from the middle of the trunk down to the middle of a standing body, metres."""
-BACK_JUMP_NS = 1_000_000_000
-"""Backward step of stamps beyond which a stream counts as restarted, nanoseconds."""
-MOST_IMAGES = 30
-"""Largest number of images that wait for their poses; two seconds of images."""
+FOLLOW_STEP = 0.1  # largest step of the viewpoint per message along an axis, metres
+BELOW_TRUNK = 0.25  # distance from the middle of the trunk down to the middle of a standing body, metres
+BACK_JUMP_NS = 1_000_000_000  # backward step of stamps beyond which a stream counts as restarted, nanoseconds
+MOST_IMAGES = 30  # largest number of images that wait for their poses; two seconds of images
 _TRUNK = [J["pelvis"], *HIPS, *SHOULDERS]
 
 

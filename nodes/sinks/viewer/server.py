@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 2**28
 """Largest size of the drawings kept for browsers that connect later, bytes; about five minutes of one body."""
-FIRST = 100
-"""Number of first pieces that are never dropped. They include names, colours and layout."""
+FIRST = 100  # number of first pieces that are never dropped. They include names, colours and layout.
 WAIT_S = 0.5
 """Longest time a reader waits for the next piece before it checks whether its browser is connected, seconds."""
 
@@ -88,8 +87,7 @@ POLICY = (
     "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-src 'none'; form-action 'none'; base-uri 'self'"
 )
-DRAWINGS = "drawings.rrd"
-"""Last part of the drawings' path, after the token."""
+DRAWINGS = "drawings.rrd"  # last part of the drawings' path, after the token
 
 
 class PageServer:

@@ -40,10 +40,8 @@ POLICY = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 MAX_CLIENTS = 16
-EVENTS_KEPT = 64
-"""Largest number of event messages in a client's queue. Newer ones do not replace them."""
-STREAMS_KEPT = 64
-"""Largest number of streams whose newest message is kept for clients that connect later."""
+EVENTS_KEPT = 64  # largest number of event messages in a client's queue. Newer ones do not replace them.
+STREAMS_KEPT = 64  # largest number of streams whose newest message is kept for clients that connect later
 
 
 class WebServer:
