@@ -54,8 +54,9 @@ def test_a_camera_sees_what_is_projected(clips: MotionClips) -> None:
 @pytest.mark.timeout(900)  # minutes of fits, on a busy machine
 def test_the_protocol_in_small(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(humor, "VARIANTS", {name: VARIANTS[name] for name in ("no contacts", MVAE)})
-    for module in (humor, fits):
-        monkeypatch.setattr(module, "FitSettings", lambda: FitSettings(root_steps=0, pose_steps=10, motion_steps=10))
+    short = FitSettings(root_steps=0, pose_steps=10, motion_steps=10)
+    monkeypatch.setattr(humor, "FitSettings", lambda: short)
+    monkeypatch.setattr(humor, "CAMERA", short)
     with Progress(disable=True) as progress:
         result = humor.run(Bench(quick=True, mocap=None, data=tmp_path / "nowhere.npz", progress=progress))
     assert [table.name for table in result.tables] == [
