@@ -86,7 +86,7 @@ PARTS: Mapping[str, Part] = {
     "without the share of white noise": Part(
         PriorSettings(), lambda: mock.patch.object(inference, "fallback", lambda white, *_: np.zeros(len(white)))
     ),
-    "without slow error": Part(PriorSettings(bias_sigma=0.0)),
+    "without the expected bias": Part(PriorSettings(bias_sigma=0.0)),
     "without HG-VAE's denoising": Part(PriorSettings(denoise=DenoiseSettings(enabled=False))),
     "without denoising time-correlated noise": Part(
         PriorSettings(),
@@ -128,7 +128,7 @@ CONDITIONS: Mapping[str, Condition] = {
 FLAGGING = (
     AS_IT_SHIPS,
     "without the gate",
-    "without slow error",
+    "without the expected bias",
     "without HG-VAE's denoising",
     "without the person's bones",
     "without the score",

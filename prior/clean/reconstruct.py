@@ -180,8 +180,8 @@ def _denoise(positions, sigma, seen, reconstructed, noise, late, apart, frames, 
 def _place_pelvis(reconstructed, seen):
     """Replace the pelvis (B, K, 22, 3), in place, with the mean of hips and spine less their mean observed offsets.
 
-    The pelvis's track is relative to the mean of the trunk's path, the other tracks to the path itself. No other joint
-    therefore informs HG-VAE of the pelvis's noise. ``seen`` (B, T, 22, 3) are the observations.
+    The pelvis's track is relative to the mean of the trunk's trajectory, the other tracks to the trajectory itself. No
+    other joint therefore informs HG-VAE of the pelvis's noise. ``seen`` (B, T, 22, 3) are the observations.
     """
     joints = len(_BESIDE_PELVIS)
     lies, counts = np.empty((joints, 3)), np.empty(joints)
