@@ -1,7 +1,8 @@
 """HG-VAE's input: windows of root-relative joints (*tracks*) of a body of standard size that faces forward.
 
-The root is a smooth trajectory, the *path*: a low-passed mean of the trunk's observed joints, which neither jitters
-with one noisy joint nor jumps when a joint disappears. The track of every joint except the pelvis is its position
+The root is a smooth trajectory, the *path*: a filtered mean of the trunk's observed joints, which neither jitters
+with one noisy joint nor jumps when a joint disappears. Motion up to 2 Hz is in the path, and faster motion (of a camera
+that bounces, for example) as far as it exceeds the noise. The track of every joint except the pelvis is its position
 relative to the path. The pelvis's track is relative to the path's mean, so it contains the locomotion. Unobserved
 entries are interpolated, as a start for the completion network: in a gap, a joint's offset from its parent is
 interpolated linearly; before the first and after the last observation, the offset is held.
@@ -22,8 +23,11 @@ _SIDES = np.array([HIPS, SHOULDERS])
 _TALL = np.array([J[n] for n in ("left_knee", "left_ankle", "right_knee", "right_ankle", "spine1", "spine2", "spine3",
                                  "neck")])  # fmt: skip
 _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
-_PATH_COEFFICIENTS = 8
-"""Number of cosine coefficients of the path that are kept: a low pass at 2 Hz for a window of 50 frames."""
+_KEPT = 8
+"""Number of cosine coefficients of the path that are kept whatever the noise: up to 2 Hz for a window of 50 frames."""
+
+_LEAST_VARIANCE = 1e-12
+"""Least mean square of neighbouring coefficients, m², so that their filter is defined."""
 
 
 class Tracks(NamedTuple):
@@ -42,16 +46,26 @@ def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.sqrt((offsets[..., _TALL, :] ** 2).sum(axis=-1)).sum(axis=-1) / _STANDARD
 
 
-def to_tracks(positions: NDArray[np.float64], size: NDArray[np.floating] | float) -> Tracks:
-    """Convert windows (..., T, 22, 3) metres, z up, NaN where missing, of bodies of these sizes (...) (`body_size`) to
-    tracks."""
+def to_tracks(
+    positions: NDArray[np.float64],
+    size: NDArray[np.floating] | float,
+    noise: NDArray[np.floating] | float = math.inf,
+) -> Tracks:
+    """Convert windows to tracks.
+
+    Args:
+        positions: (..., T, 22, 3) metres, z up, NaN where missing.
+        size: (...) sizes of the bodies (`body_size`).
+        noise: (...) metres along an axis, standard deviation of an observed position. If it is infinite, the path is
+            low-passed at 2 Hz.
+    """
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
-    sizes = np.empty(batch)
-    sizes[...] = size
+    sizes, variances = np.empty(batch), np.empty(batch)
+    sizes[...], variances[...] = size, np.square(noise)
     x, observed = np.empty((2, len(windows), 66, frames))
     path, yaw = np.empty((len(windows), frames, 3)), np.empty(len(windows))
-    _to_tracks(windows, sizes.ravel(), _low_pass(frames), x, observed, path, yaw)
+    _to_tracks(windows, sizes.ravel(), variances.ravel(), _cosines(frames), x, observed, path, yaw)
     return Tracks(*(part.reshape((*batch, *part.shape[1:])) for part in (x, observed, path, yaw)))
 
 
@@ -86,17 +100,17 @@ def hang_unseen(deviations: NDArray[np.floating]) -> None:
     _hang_unseen(deviations.reshape(-1, 22, 3, deviations.shape[-1]))
 
 
-_low_passes: dict[int, NDArray[np.float64]] = {}
+_bases: dict[int, NDArray[np.float64]] = {}
 
 
-def _low_pass(frames: int) -> NDArray[np.float64]:
-    """(T, T) projection onto the lowest cosines."""
-    if frames not in _low_passes:
-        k, n = np.arange(_PATH_COEFFICIENTS)[:, None], np.arange(frames)
+def _cosines(frames: int) -> NDArray[np.float64]:
+    """(T, T) orthonormal cosine transform; row k is the k-th frequency."""
+    if frames not in _bases:
+        k, n = np.arange(frames)[:, None], np.arange(frames)
         basis = np.sqrt(2 / frames) * np.cos(np.pi / (2 * frames) * (2 * n + 1) * k)
         basis[0] /= np.sqrt(2)
-        _low_passes[frames] = np.ascontiguousarray(basis.T @ basis)
-    return _low_passes[frames]
+        _bases[frames] = basis
+    return _bases[frames]
 
 
 # ---------------------------------------------------------------------------------------------------------------
@@ -104,15 +118,16 @@ def _low_pass(frames: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
-    """Write the four parts of `Tracks` for B windows (B, T, 22, 3)."""
+def _to_tracks(windows, sizes, variances, cosines, all_x, all_observed, all_path, yaws):
+    """Write the four parts of `Tracks` for B windows (B, T, 22, 3). ``variances`` (B,) are the noise's, m²."""
     frames, joints = windows.shape[1:3]
     still = np.zeros(frames)
     middle = np.empty((frames, 3))
     for window in range(len(windows)):
         positions, x, observed = windows[window], all_x[window], all_observed[window]
         yaw = yaws[window] = _heading(positions)
-        path = np.dot(low_pass, _centre(positions, yaw, sizes[window]), all_path[window])
+        path = all_path[window]
+        _write_path(_centre(positions, yaw, sizes[window]), variances[window] / _trunk_joints(positions), cosines, path)
         for axis in range(3):
             mean = _mean(path, axis)
             for t in range(frames):
@@ -138,6 +153,43 @@ def _to_tracks(windows, sizes, low_pass, all_x, all_observed, all_path, yaws):
             for axis in range(3):
                 # relative to the nearest ancestor that was ever observed, whose gaps are already filled
                 _bridge(x[3 * j + axis], x[3 * parent + axis] if parent > 0 else still)
+
+
+@njit(cache=True)
+def _trunk_joints(positions):
+    """Mean number of observed joints of the trunk, at least one in the window."""
+    seen = 0
+    for t in range(len(positions)):
+        for k in range(len(TRUNK)):
+            seen += not math.isnan(positions[t, TRUNK[k], 0])
+    return max(seen, 1) / len(positions)
+
+
+@njit(cache=True)
+def _write_path(centre, variance, cosines, path):
+    """Write the path (T, 3), which is ``centre`` (T, 3) after a Wiener filter.
+
+    The filter multiplies each frequency by the signal's share of the variance. That of signal and noise is the mean
+    over neighbouring frequencies and the three axes; ``variance`` is the noise's, m².
+    """
+    frames = len(centre)
+    coefficients = np.dot(cosines, centre)
+    square = np.zeros(frames)
+    for k in range(frames):
+        for axis in range(3):
+            square[k] += coefficients[k, axis] ** 2 / 3.0
+    for k in range(_KEPT, frames):
+        first, last = max(k - 1, _KEPT), min(k + 1, frames - 1)
+        total = _LEAST_VARIANCE
+        for near in range(first, last + 1):
+            total += square[near] / (last - first + 1)
+        signal = max(0.0, 1.0 - variance / total)
+        for axis in range(3):
+            coefficients[k, axis] *= signal
+    along = np.dot(np.ascontiguousarray(coefficients.T), cosines)
+    for t in range(frames):
+        for axis in range(3):
+            path[t, axis] = along[axis, t]
 
 
 @njit(cache=True)

@@ -7,9 +7,10 @@ from tests.helpers.values import clean_bodies, gated
 from steadypose.msgs.types import JointState
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.skeleton import J
+from steadypose.prior.clean.frame import BodyWindows
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
-from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, SETTLED, Denoise, _place_pelvis
+from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, SETTLED, Denoise, Reconstruct, _place_pelvis
 from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 from steadypose.prior.timing.kalman import Smoothed
 
@@ -122,6 +123,29 @@ def test_a_bias_counts_unless_noise_is_known_to_be_white(
     clean_bodies(truth + lfilter([1.0], [1.0, -correlation], noise, axis=0))
     assert least <= min(counted[40:])
     assert max(counted[40:]) <= most
+
+
+@pytest.mark.parametrize(("correlation", "least", "most"), [(0.0, 0.8, 1.0), (0.9, 0.0, 0.2)])
+def test_the_path_follows_a_bouncing_camera_but_no_time_correlated_noise(
+    correlation: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``least`` and ``most`` are shares of a bounce of 4 cm at 3 Hz, which is faster than a person's path."""
+    paths, update = [], Reconstruct.update
+
+    def noted(*args) -> BodyWindows | None:
+        windows = update(*args)
+        assert windows
+        paths.append(windows.tracks.path[0])
+        return windows
+
+    monkeypatch.setattr(Reconstruct, "update", noted)
+    bounce = 0.04 * np.sin(2 * np.pi * 3 * np.arange(100) / 30)
+    noise = np.random.default_rng(1).normal(0.0, 0.005, (100, 22, 3))
+    at_rest = np.tile(waving(1), (100, 1, 1)) + bounce[:, None, None] * [0, 0, 1]
+    clean_bodies(at_rest + lfilter([1.0], [1.0, -correlation], noise, axis=0))
+    window = np.sin(2 * np.pi * 3 * np.arange(50) / 30)  # 50 frames are five periods
+    found = 2 * window @ paths[99][:, 2] / 50
+    assert least * 0.04 <= abs(found) <= most * 0.04
 
 
 def test_hidden_joints_and_bodies_that_left_are_not_touched() -> None:

@@ -77,6 +77,28 @@ def test_tracks_do_not_depend_on_where_a_body_is_or_faces(turn, east, north, siz
     np.testing.assert_allclose(from_tracks(in_frame_of(there, other, size), there, size), other, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("noise", "least", "most"),
+    [(0.0, 0.0, 1e-6), (0.005, 1e-3, 0.1), (0.1, 0.4, 0.8), (np.inf, 0.95, 1.0)],
+)
+def test_a_bounce_of_the_whole_body_stays_in_its_tracks_as_far_as_it_may_be_noise(noise, least, most) -> None:
+    """``least`` and ``most`` are shares of the bounce, of 3 cm at 5 Hz, in tracks of 50 frames."""
+    window = waving(50)
+    bounce = 0.03 * np.sin(2 * np.pi * 5 * np.arange(50) / 30)
+    bounced = window + bounce[:, None, None] * [0, 1, 0]
+    heads = (to_tracks(w, 1.0, noise).x[3 * J["head"] : 3 * J["head"] + 3] for w in (window, bounced))
+    left = np.linalg.norm(next(heads) - next(heads)) / np.linalg.norm(bounce)
+    assert least <= left <= most
+
+
+def test_noise_of_the_stated_deviation_hardly_enters_the_path() -> None:
+    noisy = np.tile(waving(1), (50, 1, 1)) + np.random.default_rng(4).normal(0.0, 0.02, (50, 22, 3))
+    known, low_passed, followed = (
+        np.diff(to_tracks(noisy, 1.0, noise).path, axis=0).std() for noise in (0.02, np.inf, 0.0)
+    )
+    assert known - low_passed < 0.1 * (followed - low_passed)
+
+
 def test_the_guess_of_a_hidden_joint_goes_with_the_one_it_hangs_from() -> None:
     window = waving(30)
     foot, ankle = J["left_foot"], J["left_ankle"]
