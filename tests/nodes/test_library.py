@@ -193,6 +193,7 @@ def test_as_a_table_and_as_a_dataset() -> None:
 
 def test_the_sample_has_its_truth() -> None:
     sample = steadypose.sample()
+    assert np.isfinite(sample.truth).all()
     assert sample.positions.shape == sample.truth.shape == (len(sample.stamp_ns), 22, 3)
     assert 0.1 < np.isnan(sample.positions).mean() < 0.5
     assert 0.5 < np.nanmedian(sample.positions[:, 0, 2]) < 1.2, "z is up, in metres"
