@@ -31,7 +31,7 @@ from steadypose.benchmarks.studies import hidden_joints, noisy_joints
 from steadypose.benchmarks.studies.corrupted import Condition
 from steadypose.benchmarks.studies.world import chain, measure
 from steadypose.prior.arrays import Floats
-from steadypose.prior.clean import steady
+from steadypose.prior.clean import reconstruct, steady
 from steadypose.prior.clean.exchanged import ExchangedLimbs
 from steadypose.prior.clean.pipeline import PriorPipeline
 from steadypose.prior.clean.reconstruct import Denoise
@@ -48,6 +48,7 @@ from steadypose.prior.clean.settings import (
     ScoreSettings,
     SteadySettings,
 )
+from steadypose.prior.models.hgvae.features import to_tracks
 from steadypose.prior.models.mixture import inference
 from steadypose.prior.world.pipeline import TrajectoryPipeline
 from steadypose.prior.world.settings import TrajectorySettings
@@ -96,6 +97,10 @@ PARTS: Mapping[str, Part] = {
             lambda *of, bare=Denoise._denoised: bare(*of[:-2], np.zeros_like(of[-2]), of[-1]),
         ),
     ),
+    "with paths low-passed at 2 Hz": Part(
+        PriorSettings(),
+        lambda: mock.patch.object(reconstruct, "to_tracks", lambda seen, size, _: to_tracks(seen, size)),
+    ),
     "without the person's bones": Part(PriorSettings(person=PersonSettings(enabled=False))),
     "without the score": Part(PriorSettings(score=ScoreSettings(enabled=False))),
     "without completion": Part(PriorSettings(impute=ImputeSettings(enabled=False))),
@@ -122,8 +127,11 @@ CONDITIONS: Mapping[str, Condition] = {
         "1 cm", "2 cm", "4 cm", "1 cm, sides", "correlated 2 cm", "correlated 2 cm, spikes, swaps", "0.5 s",
         "legs unobserved",
     )
-}  # fmt: skip
+} | {"1 cm, camera bounces": noisy_joints.CONDITIONS["1 cm"]}  # fmt: skip
 """Conditions. If joints are hidden, their error is measured, otherwise that of all joints."""
+
+BOUNCE_HEIGHT, BOUNCE_HZ = 0.04, 3.0
+"""Amplitude, metres, and frequency of a camera on a robot that bounces without publishing its pose."""
 
 FLAGGING = (
     AS_IT_SHIPS,
@@ -153,12 +161,16 @@ def run(bench: Bench) -> Result:
     cost = costs(clips)
     records: list[dict[str, Any]] = []
     for number, (condition, corrupt) in enumerate(CONDITIONS.items()):
-        seen = corrupt(clips.positions, np.random.default_rng(number))
+        truth = clips.positions
+        if condition.endswith("camera bounces"):
+            phase = 2 * np.pi * BOUNCE_HZ * clips.stamps_s[:, None] + np.arange(truth.shape[1])
+            truth = truth + (BOUNCE_HEIGHT * np.sin(phase))[..., None, None] * [0.0, 0.0, 1.0]
+        seen = corrupt(truth, np.random.default_rng(number))
         hidden = missing(seen)
         for name, part in bench.progress.track(PARTS.items(), description=condition):
             with part.replaced():
                 answer = product.run(part.settings, seen, clips.stamps_s, DELAY).positions
-            found = score(answer, clips.positions, hidden)
+            found = score(answer, truth, hidden)
             errors = found.hidden if hidden.any() else found.position
             records.append(_record(condition, name, errors, found.acceleration))
     flags = _flags(bench, clips)

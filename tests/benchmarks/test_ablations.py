@@ -15,6 +15,7 @@ REPLACED = {
     "without the share of white noise",
     "without denoising time-correlated noise",
     "without straight paths",
+    "with paths low-passed at 2 Hz",
 }
 
 
@@ -33,6 +34,7 @@ def test_each_row_changes_one_setting_and_every_stage_that_is_on_has_a_row() -> 
 def test_what_has_no_setting_is_replaced_only_while_it_is_measured() -> None:
     clips, rng = simulated_clips(60, 1, seed=0), np.random.default_rng(0)
     seen = sides_exchanged(gaussian(correlated(clips.positions, 0.02, rng), 0.01, rng), rng)
+    seen[:, :, :, 2] += 0.1 * np.sin(20.0 * clips.stamps_s)[:, None, None]  # the camera bounces
 
     def positions() -> np.ndarray:
         return product.run(PriorSettings(), seen, clips.stamps_s, 4).positions
