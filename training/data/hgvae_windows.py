@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,9 +18,6 @@ from steadypose.training.networks.hgvae import HGVAE
 
 STRIDES = (1, 1, 1, 2)
 """Frame strides of training windows; a quarter is played at twice the speed, because most recordings are slow."""
-
-PATH_NOISE, CORRELATED_SHARE = (1e-3, 2e-2), 0.3
-"""Of `draw_path_noise`: range of the noise, metres, and share of windows in which it is infinite."""
 
 
 class Windows:
@@ -43,13 +39,6 @@ class Windows:
         return self.clean(self.motion.sample(count, frames, strides, rng), rng.random(count) < 0.5)
 
 
-def draw_path_noise(count: int, rng: np.random.Generator) -> Floats:
-    """(B,) metres, noise with which to filter the paths of training windows. In the product it is estimated from each
-    body, and almost infinite if it is time-correlated."""
-    noise = np.exp(rng.uniform(np.log(PATH_NOISE[0]), np.log(PATH_NOISE[1]), count))
-    return np.where(rng.random(count) < CORRELATED_SHARE, np.inf, noise)
-
-
 class Batch(NamedTuple):
     x: Tensor  # (B, 66, T) tracks minus the model's mean, in units of `SCALE`; interpolated where unobserved
     observed: Tensor  # (B, 66, T) 1 where observed
@@ -58,11 +47,9 @@ class Batch(NamedTuple):
     counts: Tensor  # (B, 1, T) weight in the loss: 1 from the body's first observation on, 0 before it
 
     @classmethod
-    def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats, noise: Floats | float = math.inf) -> Batch:
-        """Build a batch from observed and true positions (B, T, 22, 3) metres, NaN where unobserved, and sizes (B,).
-        ``noise`` (B,) is that of the path (`to_tracks`)."""
-        noises = np.broadcast_to(noise, sizes.shape)
-        tracks = [to_tracks(window, size, sigma) for window, size, sigma in zip(seen, sizes, noises, strict=True)]
+    def of(cls, model: HGVAE, seen: Floats, truth: Floats, sizes: Floats) -> Batch:
+        """Build a batch from observed and true positions (B, T, 22, 3) metres, NaN where unobserved, and sizes (B,)."""
+        tracks = [to_tracks(window, size) for window, size in zip(seen, sizes, strict=True)]
         true = [in_frame_of(t, window, size) for t, window, size in zip(tracks, truth, sizes, strict=True)]
         observed = torch.from_numpy(np.stack([t.observed for t in tracks])).float()
         counts = (observed.amax(dim=1, keepdim=True).cumsum(dim=-1) > 0).float()

@@ -32,7 +32,7 @@ from steadypose.training.data.corruption import (
     with_faults,
 )
 from steadypose.training.data.dataset import SpeedWeightedWindows
-from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, draw_path_noise, mean_tracks
+from steadypose.training.data.hgvae_windows import STRIDES, Batch, Windows, mean_tracks
 from steadypose.training.loop import Recipe, Rng, TrainingOptions
 from steadypose.training.networks.graph import CompletionNet
 from steadypose.training.networks.hgvae import HGVAE, HGVAEOutput
@@ -78,7 +78,7 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
         clean = np.concatenate(builds)
         bias_sigma = draw_bias_sigma(count, rng)
         observed = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, FAULT_SHARE, rng), rng)
-        off, log_var, hidden = _errors(model, observed, clean, sizes, bias_sigma, draw_path_noise(count, rng))
+        off, log_var, hidden = _errors(model, observed, clean, sizes, bias_sigma)
         density = 0.5 * (log_var + off.square() * (-log_var).exp())
         loss = (density * (0.5 * log_var.detach()).exp())[hidden].mean()
         return loss, {"loss": loss.item()}
@@ -90,16 +90,11 @@ def completion_recipe(model: HGVAE, train: Windows, val: Windows, rate: float) -
 
 
 def _errors(
-    model: HGVAE,
-    noisy: Floats,
-    truth: Floats,
-    sizes: Floats,
-    bias_sigma: Floats | float,
-    path_noise: Floats | float = math.inf,
+    model: HGVAE, noisy: Floats, truth: Floats, sizes: Floats, bias_sigma: Floats | float
 ) -> tuple[Tensor, ...]:
     """Return errors (B, 66, T) of completed windows (B, T, 22, 3), their predicted log-variance, both in units of
     `SCALE`, and which entries were hidden since the body's first observation."""
-    batch = Batch.of(model, noisy, truth, sizes, path_noise)
+    batch = Batch.of(model, noisy, truth, sizes)
     completed, log_var = _network(model).complete(batch.x, batch.observed, bias_sigma)
     off = completed - batch.target
     return off, log_var.repeat_interleave(3, dim=1), (batch.observed == 0) & (batch.counts > 0)
@@ -118,8 +113,7 @@ def evaluate_completion(model: HGVAE, val: Windows, windows: int = 512) -> dict[
     rng = np.random.default_rng(1)
     clean, sizes = val.draw(windows, model.config.frames, rng)
     bias_sigma = draw_bias_sigma(windows, rng)
-    noisy = occlude(add_noise(clean, rng, bias_sigma), rng)
-    off, log_var, hidden = _errors(model, noisy, clean, sizes, bias_sigma, draw_path_noise(windows, rng))
+    off, log_var, hidden = _errors(model, occlude(add_noise(clean, rng, bias_sigma), rng), clean, sizes, bias_sigma)
     scores = {"hidden mm": _rms_mm(off[hidden]), "error/sigma": (off * (-0.5 * log_var).exp())[hidden].std().item()}
     for count in (1, 4):
         observed = clean.copy()
@@ -211,12 +205,11 @@ def recipe_of(train: Windows, val: Windows, rate: float) -> Recipe[HGVAE]:
     def loss_of(model: HGVAE, count: int, done: float, rng: Rng) -> tuple[Tensor, dict[str, float]]:
         positions, sizes = train.draw(count, model.config.frames, rng, STRIDES)
         half = count // 2
-        noise = draw_path_noise(count, rng)
-        whole = Batch.of(model, positions[:half], positions[:half], sizes[:half], noise[:half])
+        whole = Batch.of(model, positions[:half], positions[:half], sizes[:half])
         bias_sigma = draw_bias_sigma(count - half, rng)
         clean = vary_builds(positions[half:], BONE_SIGMA, TURN_SIGMA, rng)
         observed = occlude(with_faults(add_noise(clean, rng, bias_sigma), FAULTS, 0.5, rng), rng)
-        both = whole.joined(Batch.of(model, observed, clean, sizes[half:], noise[half:]).completed(model, bias_sigma))
+        both = whole.joined(Batch.of(model, observed, clean, sizes[half:]).completed(model, bias_sigma))
         drawn = model(both.x, both.certainty, spread=(torch.arange(count) < half).float()[:, None])
         density = drawn.tracks.log_density(both.target) * both.counts
         sigma = (0.5 * drawn.tracks.log_var[half:]).exp().detach()
@@ -249,12 +242,11 @@ def evaluate_hgvae(model: HGVAE, val: Windows, windows: int = 512) -> dict[str, 
     the error-to-sigma ratio of the hidden joints."""
     rng = np.random.default_rng(1)
     positions, sizes = val.draw(windows, model.config.frames, rng)
-    noise = draw_path_noise(windows, rng)
-    whole = Batch.of(model, positions, positions, sizes, noise)
+    whole = Batch.of(model, positions, positions, sizes)
     likelihood, kl = evidence(model(whole.x, whole.certainty, spread=torch.ones(windows, 1)), whole.target)
     whole_output = model(whole.x, whole.certainty)
     bias_sigma = draw_bias_sigma(windows, rng)
-    partial = Batch.of(model, occlude(add_noise(positions, rng, bias_sigma), rng), positions, sizes, noise)
+    partial = Batch.of(model, occlude(add_noise(positions, rng, bias_sigma), rng), positions, sizes)
     partial = partial.completed(model, bias_sigma)
     completed = model(partial.x, partial.certainty)
     hidden = (partial.observed[:, ::3] == 0) & (partial.counts > 0)
