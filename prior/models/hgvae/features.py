@@ -127,7 +127,7 @@ def _to_tracks(windows, sizes, variances, cosines, all_x, all_observed, all_path
         positions, x, observed = windows[window], all_x[window], all_observed[window]
         yaw = yaws[window] = _heading(positions)
         path = all_path[window]
-        _write_path(_centre(positions, yaw, sizes[window]), variances[window] / _trunk_joints(positions), cosines, path)
+        _write_path(positions, yaw, sizes[window], variances[window], cosines, path)
         for axis in range(3):
             mean = _mean(path, axis)
             for t in range(frames):
@@ -156,36 +156,47 @@ def _to_tracks(windows, sizes, variances, cosines, all_x, all_observed, all_path
 
 
 @njit(cache=True)
-def _trunk_joints(positions):
-    """Mean number of observed joints of the trunk, at least one in the window."""
-    seen = 0
+def _observed_throughout(positions):
+    """(9,) which joints of the trunk are observed in every frame in which any of them is."""
+    whole = np.ones(len(TRUNK), dtype=np.bool_)
     for t in range(len(positions)):
+        some = False
         for k in range(len(TRUNK)):
-            seen += not math.isnan(positions[t, TRUNK[k], 0])
-    return max(seen, 1) / len(positions)
+            some |= not math.isnan(positions[t, TRUNK[k], 0])
+        for k in range(len(TRUNK)):
+            whole[k] &= not (some and math.isnan(positions[t, TRUNK[k], 0]))
+    return whole
 
 
 @njit(cache=True)
-def _write_path(centre, variance, cosines, path):
-    """Write the path (T, 3), which is ``centre`` (T, 3) after a Wiener filter.
+def _write_path(positions, yaw, size, variance, cosines, path):
+    """Write the path (T, 3): the trunk's centre, whose fast part passes a Wiener filter.
 
     The filter multiplies each frequency by the signal's share of the variance. That of signal and noise is the mean
-    over neighbouring frequencies and the three axes; ``variance`` is the noise's, m².
+    over neighbouring frequencies and the three axes; ``variance`` is the noise's, m². The fast part is that of the
+    joints observed throughout, because the centre of all jumps where one comes or goes.
     """
-    frames = len(centre)
-    coefficients = np.dot(cosines, centre)
+    frames = len(positions)
+    whole = _observed_throughout(positions)
+    joints = 0
+    for k in range(len(whole)):
+        joints += whole[k]
+    coefficients = np.dot(cosines, _centre(positions, yaw, size, np.ones(len(whole), dtype=np.bool_)))
+    fast = coefficients
+    if 0 < joints < len(whole):
+        fast = np.dot(cosines, _centre(positions, yaw, size, whole))
     square = np.zeros(frames)
     for k in range(frames):
         for axis in range(3):
-            square[k] += coefficients[k, axis] ** 2 / 3.0
+            square[k] += fast[k, axis] ** 2 / 3.0
     for k in range(_KEPT, frames):
         first, last = max(k - 1, _KEPT), min(k + 1, frames - 1)
         total = _LEAST_VARIANCE
         for near in range(first, last + 1):
             total += square[near] / (last - first + 1)
-        signal = max(0.0, 1.0 - variance / total)
+        signal = max(0.0, 1.0 - variance / joints / total) if joints > 0 else 0.0
         for axis in range(3):
-            coefficients[k, axis] *= signal
+            coefficients[k, axis] = signal * fast[k, axis]
     along = np.dot(np.ascontiguousarray(coefficients.T), cosines)
     for t in range(frames):
         for axis in range(3):
@@ -270,14 +281,17 @@ def _heading(positions):
 
 
 @njit(cache=True)
-def _centre(positions, yaw, size):
-    """(T, 3) pelvis position from the observed joints of the trunk; interpolated or held where none is observed."""
+def _centre(positions, yaw, size, among):
+    """(T, 3) pelvis position from those joints of the trunk that are ``among`` (9,) and observed; interpolated or held
+    where none is."""
     frames = len(positions)
     c, s = math.cos(yaw), math.sin(yaw)
     centre = np.zeros((frames, 3))
     weight = np.zeros(frames)
     lies, seen = np.zeros(3), np.zeros(3)
     for k in range(len(TRUNK)):
+        if not among[k]:
+            continue
         j, count = TRUNK[k], 0
         for axis in range(3):
             seen[axis] = 0.0
