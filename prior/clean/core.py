@@ -115,9 +115,7 @@ class CleanCore:
         smoothed = self._smooth.update(gated.positions, observation.stamp_s, observation.confidence)
         windows = None
         if self._reconstruct:
-            windows = self._reconstruct.update(
-                self._history, present, person, bias_sigma, gated.jitter, self._smooth.correlated
-            )
+            windows = self._reconstruct.update(self._history, present, person, bias_sigma, self._smooth.correlated)
         if self._denoise:
             correlated_sigma = (1.0 - self._smooth.white) * bias_sigma
             smoothed = self._denoise.update(windows, smoothed, self._history, gated.jitter, correlated_sigma)

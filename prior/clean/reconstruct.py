@@ -25,7 +25,8 @@ from steadypose.prior.timing.rate import FPS
 
 MIN_CONFIDENCE = 0.1  # least confidence assigned to a joint that passed the gate
 
-LEAST_UNCERTAIN = 1e-3  # least uncertainty, of 1, that the noise is time-correlated
+PATH_NOISE, LEAST_UNCERTAIN = 3.0, 1e-3
+"""`noise_ratio` of the path in noise that is not time-correlated, and least uncertainty, of 1, that it is."""
 
 MODEL_SIGMA = 0.005
 """Least standard deviation along an axis of HG-VAE's own error, excluding the sensor's noise, metres."""
@@ -60,26 +61,19 @@ class Reconstruct:
         self.frames = self._model.frames
 
     def update(
-        self,
-        history: History,
-        present: Bools,
-        person: Person,
-        bias_sigma: Floats,
-        jitter: Floats,
-        correlated: Floats,
+        self, history: History, present: Bools, person: Person, bias_sigma: Floats, correlated: Floats
     ) -> BodyWindows | None:
         """Reconstruct the windows of the bodies ``present`` (S,); None if there is none.
 
-        ``bias_sigma`` and ``jitter`` (S,) metres along an axis are estimated from each body; ``correlated`` (S,) is the
-        certainty that the noise is time-correlated, 0 to 1. If it is, as a Kinect's, the trunk's joints err together
-        and the path must not follow them.
+        ``bias_sigma`` (S,) metres along an axis is estimated from each body; ``correlated`` (S,) is the certainty that
+        its noise is time-correlated, 0 to 1. The highest frequencies do not show such noise, so the path is low-passed.
         """
         slots = np.flatnonzero(present)
         if not len(slots):
             return None
         size = body_size(person.offsets[slots])
-        noise = jitter[slots] / np.maximum(1.0 - correlated[slots], LEAST_UNCERTAIN) ** 2
-        tracks = to_tracks(history.positions[-self.frames :, slots].swapaxes(0, 1), size, noise)
+        noise_ratio = PATH_NOISE / np.maximum(1.0 - correlated[slots], LEAST_UNCERTAIN) ** 2
+        tracks = to_tracks(history.positions[-self.frames :, slots].swapaxes(0, 1), size, noise_ratio)
         by_joint = np.clip(history.confidence[-self.frames :, slots], MIN_CONFIDENCE, 1.0)
         confidence = tracks.observed * np.repeat(by_joint.transpose(1, 2, 0), 3, axis=1)
         return BodyWindows(slots, tracks, size, self._model.reconstruct(tracks.x, confidence, bias_sigma[slots]))

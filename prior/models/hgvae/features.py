@@ -26,8 +26,7 @@ _STANDARD = float(np.linalg.norm(REST_OFFSETS[_TALL], axis=-1).sum())
 _KEPT = 8
 """Number of cosine coefficients of the path that are kept whatever the noise: up to 2 Hz for a window of 50 frames."""
 
-_LEAST_VARIANCE = 1e-12
-"""Least mean square of neighbouring coefficients, m², so that their filter is defined."""
+_LEAST_VARIANCE = 1e-12  # least variance of a frequency of the path, m², so that its filter is defined
 
 
 class Tracks(NamedTuple):
@@ -49,23 +48,23 @@ def body_size(offsets: NDArray[np.floating]) -> NDArray[np.float64]:
 def to_tracks(
     positions: NDArray[np.float64],
     size: NDArray[np.floating] | float,
-    noise: NDArray[np.floating] | float = math.inf,
+    noise_ratio: NDArray[np.floating] | float = math.inf,
 ) -> Tracks:
     """Convert windows to tracks.
 
     Args:
         positions: (..., T, 22, 3) metres, z up, NaN where missing.
         size: (...) sizes of the bodies (`body_size`).
-        noise: (...) metres along an axis, standard deviation of an observed position. If it is infinite, the path is
-            low-passed at 2 Hz.
+        noise_ratio: (...) largest ratio of the deviation of the trunk's noise at any frequency to that at the highest
+            frequencies, where it is measured. If it is infinite, the path is low-passed at 2 Hz.
     """
     batch, frames = positions.shape[:-3], positions.shape[-3]
     windows = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, frames, 22, 3)
-    sizes, variances = np.empty(batch), np.empty(batch)
-    sizes[...], variances[...] = size, np.square(noise)
+    sizes, ratios = np.empty(batch), np.empty(batch)
+    sizes[...], ratios[...] = size, noise_ratio
     x, observed = np.empty((2, len(windows), 66, frames))
     path, yaw = np.empty((len(windows), frames, 3)), np.empty(len(windows))
-    _to_tracks(windows, sizes.ravel(), variances.ravel(), _cosines(frames), x, observed, path, yaw)
+    _to_tracks(windows, sizes.ravel(), ratios.ravel(), _cosines(frames), x, observed, path, yaw)
     return Tracks(*(part.reshape((*batch, *part.shape[1:])) for part in (x, observed, path, yaw)))
 
 
@@ -118,8 +117,8 @@ def _cosines(frames: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _to_tracks(windows, sizes, variances, cosines, all_x, all_observed, all_path, yaws):
-    """Write the four parts of `Tracks` for B windows (B, T, 22, 3). ``variances`` (B,) are the noise's, m²."""
+def _to_tracks(windows, sizes, noise_ratios, cosines, all_x, all_observed, all_path, yaws):
+    """Write the four parts of `Tracks` for B windows (B, T, 22, 3)."""
     frames, joints = windows.shape[1:3]
     still = np.zeros(frames)
     middle = np.empty((frames, 3))
@@ -127,7 +126,7 @@ def _to_tracks(windows, sizes, variances, cosines, all_x, all_observed, all_path
         positions, x, observed = windows[window], all_x[window], all_observed[window]
         yaw = yaws[window] = _heading(positions)
         path = all_path[window]
-        _write_path(positions, yaw, sizes[window], variances[window], cosines, path)
+        _write_path(positions, yaw, sizes[window], noise_ratios[window], cosines, path)
         for axis in range(3):
             mean = _mean(path, axis)
             for t in range(frames):
@@ -169,38 +168,44 @@ def _observed_throughout(positions):
 
 
 @njit(cache=True)
-def _write_path(positions, yaw, size, variance, cosines, path):
+def _write_path(positions, yaw, size, noise_ratio, cosines, path):
     """Write the path (T, 3): the trunk's centre, whose fast part passes a Wiener filter.
 
     The filter multiplies each frequency by the signal's share of the variance. That of signal and noise is the mean
-    over neighbouring frequencies and the three axes; ``variance`` is the noise's, m². The fast part is that of the
-    joints observed throughout, because the centre of all jumps where one comes or goes.
+    over neighbouring frequencies and the three axes; the noise's is that of the highest third of the frequencies, times
+    the square of ``noise_ratio``. The fast part is that of the joints observed throughout, because the centre of all
+    jumps where one comes or goes.
     """
     frames = len(positions)
     whole = _observed_throughout(positions)
-    joints = 0
-    for k in range(len(whole)):
-        joints += whole[k]
     coefficients = np.dot(cosines, _centre(positions, yaw, size, np.ones(len(whole), dtype=np.bool_)))
     fast = coefficients
-    if 0 < joints < len(whole):
+    if whole.any() and not whole.all():
         fast = np.dot(cosines, _centre(positions, yaw, size, whole))
     square = np.zeros(frames)
     for k in range(frames):
         for axis in range(3):
             square[k] += fast[k, axis] ** 2 / 3.0
+    noise = math.inf
+    if whole.any():
+        noise = noise_ratio**2 * max(_mean_of(square, 2 * frames // 3, frames), _LEAST_VARIANCE)
     for k in range(_KEPT, frames):
-        first, last = max(k - 1, _KEPT), min(k + 1, frames - 1)
-        total = _LEAST_VARIANCE
-        for near in range(first, last + 1):
-            total += square[near] / (last - first + 1)
-        signal = max(0.0, 1.0 - variance / joints / total) if joints > 0 else 0.0
+        variance = _mean_of(square, max(k - 1, _KEPT), min(k + 2, frames))
+        signal = max(0.0, 1.0 - noise / max(variance, _LEAST_VARIANCE))
         for axis in range(3):
             coefficients[k, axis] = signal * fast[k, axis]
     along = np.dot(np.ascontiguousarray(coefficients.T), cosines)
     for t in range(frames):
         for axis in range(3):
             path[t, axis] = along[axis, t]
+
+
+@njit(cache=True)
+def _mean_of(values, first, end):
+    total = 0.0
+    for k in range(first, end):
+        total += values[k]
+    return total / (end - first)
 
 
 @njit(cache=True)
