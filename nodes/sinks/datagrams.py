@@ -147,7 +147,8 @@ def osc_bundles(time_s: float, body: WorldBody | None) -> list[bytes]:
     if body is not None:
         messages.append(build_msg("/VMC/Ext/Root/Pos", ["root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
         for name, place, turn in zip(BONES, *unity(body), strict=True):
-            messages.append(build_msg("/VMC/Ext/Bone/Pos", [name, *place.tolist(), *turn.tolist()]))
+            if np.isfinite(place).all():  # Unity takes no NaN: a bone without an estimate stays as it is
+                messages.append(build_msg("/VMC/Ext/Bone/Pos", [name, *place.tolist(), *turn.tolist()]))
     bundles = []
     for start in range(0, len(messages), _A_BUNDLE):
         bundle = OscBundleBuilder(IMMEDIATELY)

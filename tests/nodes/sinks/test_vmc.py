@@ -53,6 +53,16 @@ def test_the_bones_give_the_body_back_in_unitys_axes_and_nobody_is_said_too() ->
     assert messages(osc_bundles(0.0, None)) == [("/VMC/Ext/OK", [0]), ("/VMC/Ext/T", [0.0])]
 
 
+def test_a_bone_without_an_estimate_is_left_as_it_was() -> None:
+    body = world().bodies[0]
+    places = np.array(body.positions)
+    places[J["left_foot"]] = np.nan
+    sent = messages(osc_bundles(0.0, dataclasses.replace(body, positions=places)))
+    assert [params[0] for address, params in sent if address.endswith("Bone/Pos")] == [
+        bone for bone in BONES if bone != "LeftToes"
+    ]
+
+
 def test_the_node_sends_to_where_it_is_told(make_launch: Callable[..., Launch]) -> None:
     one = world()
     worlds = (dataclasses.replace(one, stamp_ns=stamp_ns) for stamp_ns in count(0, 33_333_333))
