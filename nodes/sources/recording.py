@@ -37,6 +37,7 @@ NO_RIG: Mapping[str, Any] = MappingProxyType({})
 _FILES = ".csv, .npz, .bvh, .trc, .c3d, .npy"
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm")
 """File name suffixes of videos, in which MediaPipe detects skeletons."""
+ANIMATIONS = (".fbx", ".glb", ".gltf", ".vrm", ".vrma")  # formats that are not read, but convert to BVH
 LOST, BROKEN, UNDECODABLE = "bytes of a damaged recording", "damaged recording", "undecodable"
 DAMAGE = (LOST, BROKEN, UNDECODABLE)  # prefixes of the causes that count unreadable parts of a recording
 
@@ -94,7 +95,9 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
     if holds_motion(path):
         return MotionSource(path, rig)
     if path.is_file() and path.suffix not in (".npz", ".csv", ".mcap"):
-        raise LaunchError(f"{path}: expected a rosbag2 directory, an .mcap, {_FILES}, or a video, got {path.suffix!r}")
+        remedy = "; export its animation as .bvh" if path.suffix.lower() in ANIMATIONS else ""
+        got = f"got {path.suffix!r}{remedy}"
+        raise LaunchError(f"{path}: expected a rosbag2 directory, an .mcap, {_FILES}, or a video, {got}")
     formats: Mapping[str, Callable[[Path], RecordedSource]] = {".npz": NpzSource, ".csv": CsvSource}
     return formats.get(path.suffix, RecordingSource)(path)
 

@@ -143,7 +143,7 @@ FILES = {
     "in.bvh": "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 3 Xrotation Yrotation Zrotation\nEnd Site\n{\nOFFSET"
     " 0 1 0\n}\n}\nMOTION\nFrames: 2\nFrame Time: 0.03\n0 0 0\n0 0 0\n",
     "own.toml": "[skeletons.own]\njoints = ['left_hip', 'right_hip']\ncanonical = {left_wrist = 'HandL'}",
-    "in.npy": "x", "in.png": "x", "in.txt": "x",
+    "in.npy": "x", "in.png": "x", "in.txt": "x", "in.fbx": "x",
 }  # fmt: skip
 ANSWERED = {
     "clean nowhere.npz out.npz": "nowhere.npz does not exist: expected",
@@ -153,6 +153,7 @@ ANSWERED = {
     "run mine.toml": "[prior.gate] has no setting 'jmup' (did you mean 'jump'?)",
     "clean in.npy out.npz": "in.npy: cannot be read",
     "clean in.png out.npz": "or a video, got '.png'",
+    "clean in.fbx out.npz": "got '.fbx'; export its animation as .bvh",
     "plot in.txt": "in.txt: expected a rosbag2 directory, an .mcap",
     "clean hip.csv /proc/out.npz": "expected a folder that can be written to",
     "clean in.csv out.json": "expected .npz or .csv for arrays, or a name without ending for a recording",
