@@ -68,6 +68,9 @@ _WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)")
 """the words of a line; the name of a joint, which may contain spaces, is one"""
 
 
+_MOTION = re.compile(r"(?<!\w)(MOTION)(?!\w)")  # not within a joint's name, such as ROOT_MOTION
+
+
 @dataclass(frozen=True)
 class Bvh:
     """A BVH file."""
@@ -117,7 +120,7 @@ def read_bvh(text: str) -> Bvh:
     Raises:
         MotionError: it is no BVH file, or its motion does not match its hierarchy.
     """
-    head, keyword, motion = text.partition("MOTION")
+    head, keyword, motion = (*_MOTION.split(text, maxsplit=1), "", "")[:3]
     last = text.rstrip().count("\n") + 1
     if not keyword:
         raise MotionError(f"expected HIERARCHY and MOTION sections, found no MOTION up to the end on line {last}")
@@ -203,7 +206,7 @@ def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], f
         values = _numbers(words[5]) if len(words) > 5 else np.empty(0)
     except ValueError as error:
         raise MotionError(_unread("motion", error)) from error
-    if seconds <= 0:
+    if not 0 < seconds < np.inf:
         raise MotionError(f"expected a frame time above zero, found {seconds}")
     if len(values) != frames * channels:
         raise MotionError(

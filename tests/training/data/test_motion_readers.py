@@ -1,3 +1,4 @@
+import re
 import tracemalloc
 
 import numpy as np
@@ -53,6 +54,15 @@ def test_a_long_bvh_takes_no_more_memory_than_a_few_copies_of_its_text_and_of_it
     tracemalloc.stop()
     assert read < 7 * len(text)  # of all words at once: 9.8
     assert computed < 2 * (bvh.values.nbytes + 2 * positions.nbytes)  # of all rotations at once: 3.3
+
+
+def test_motion_within_a_name_does_not_begin_the_motion() -> None:
+    assert read_bvh(bvh_text().replace("ROOT hip", "ROOT ROOT_MOTION")).joints[0] == "ROOT_MOTION"
+
+
+def test_a_frame_time_that_is_none_is_refused() -> None:
+    with pytest.raises(MotionError, match="expected a frame time above zero, found inf"):
+        read_bvh(re.sub("Frame Time: .*", "Frame Time: inf", bvh_text()))
 
 
 def test_decimal_commas_are_named() -> None:
