@@ -138,8 +138,9 @@ class _Spine(NamedTuple):
     head: int
 
 
-def recognise(tree: Tree) -> Rig:
+def recognise(tree: Tree, metres: float = 0.0) -> Rig:
     """Recognise the rig of a file's skeleton (see the module). A skeleton with the canonical names is used as it is.
+    ``metres`` is the file's unit; 0 to recognise it.
 
     Raises:
         MotionError: there are no two pairs of limbs below a head, or no unit gives the body a person's size.
@@ -148,14 +149,21 @@ def recognise(tree: Tree) -> Rig:
     legs, arms = _limbs(tree, pairs)
     spine = _spine(tree, legs, arms, pairs)
     scale = float(spine.heights[[spine.neck, spine.head]].sum() / _ABOVE_HIPS[[J["neck"], J["head"]]].sum())
-    metres = _metres(sum(tree.length(j) for j in legs.joints[1:]) + scale * float(_ABOVE_HIPS[J["neck"]]))
+    metres = metres or _metres(sum(tree.length(j) for j in legs.joints[1:]) + scale * float(_ABOVE_HIPS[J["neck"]]))
     if set(JOINTS) <= set(tree.joints):
         return Rig(Skeleton("file", JOINTS, {joint: joint for joint in JOINTS}), metres)
+    for name in (tree.joints[j] for j in legs.joints + arms.joints):
+        if [tree.joints.count(side) for side in (name, pairs.get(name, ""))] != [1, 1]:
+            raise MotionError(
+                f"expected each joint of legs and arms once on either side, in names that differ by left and right "
+                f"alone; '{name}' has no counterpart, or there are two: rename it, or say with {BY_RIG} which is which"
+            )
     middle = {joint: _on_spine(spine, scale * float(_ABOVE_HIPS[J[joint]])) for joint in _MIDDLE}
     parts = zip(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"), legs.joints + arms.joints, strict=True)
     left: dict[str, str | Mixture] = {part: tree.joints[j] for part, j in parts}
     left["collar"] = collar(middle["spine3"], middle["neck"], left["shoulder"])
-    toes = [j for j, parent in enumerate(tree.parents) if parent == legs.joints[-1] and tree.length(j) > 0]
+    below = (j for j, parent in enumerate(tree.parents) if parent == legs.joints[-1])
+    toes = [j for j in below if tree.length(j) > 0 and tree.joints[j] in pairs]
     if toes:
         left["foot"] = tree.joints[max(toes, key=tree.length)]
     return Rig(skeleton("file", middle, left, lambda joint: pairs.get(joint, joint)), metres)
@@ -311,6 +319,6 @@ def _metres(size: float) -> float:
     if not SHORTEST < times[unit] < TALLEST:
         raise MotionError(
             f"expected a body of 0.95 to 2.3 m in {', '.join(UNITS)}; got one whose leg and trunk are {size:.4g} long: "
-            f"say with {BY_RIG} how many metres that is"
+            f"say the size of its unit in metres with {BY_RIG}"
         )
     return unit

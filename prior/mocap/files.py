@@ -68,6 +68,8 @@ def describe(table: Mapping[str, Any]) -> Description:
     described = Description(**table)
     if strange := [joint for joint in described.canonical if joint not in JOINTS]:
         raise MotionError(f"rig [canonical]: expected joints of smpl22 ({', '.join(JOINTS)}), got {', '.join(strange)}")
+    if not (described.metres >= 0 and described.fps >= 0):
+        raise MotionError(f"rig: expected metres and fps above 0, got {described.metres:g} and {described.fps:g}")
     if described.up not in ("", *TO_Z_UP):
         raise MotionError(f"rig: up: expected one of {', '.join(TO_Z_UP)}, got {described.up!r}")
     if described.skeleton not in ("", *SKELETONS):
@@ -109,7 +111,7 @@ def file_rig(joints: Sequence[str], parents: Sequence[int], offsets: Floats, des
         return Rig(named, description.metres)
     if set(CMU_BVH.skeleton.joints) <= set(joints):
         return CMU_BVH
-    return recognise(Tree(joints, parents, offsets))
+    return recognise(Tree(joints, parents, offsets), description.metres)
 
 
 def _described(joints: Sequence[str], canonical: Mapping[str, str | Sequence[str]]) -> Skeleton:
@@ -129,6 +131,8 @@ def _bvh(content: bytes, description: Description) -> _Read:
     rig = file_rig(bvh.joints, bvh.parents, bvh.offsets, description)
     used = [bvh.joints.index(joint) for joint in rig.skeleton.joints]
     metres = description.metres or rig.metres
+    if not len(bvh.values):
+        raise MotionError("expected frames after MOTION, got none: export it again, with its animation")
     positions = metres * bvh.positions(rig.lost_bones)[:, used]
     up = description.up or rig.up or up_axis(to_canonical(rig.skeleton, positions)[0])
     # many programs write a root's OFFSET into its channels too; added to them, it lifts the body off the floor at 0

@@ -255,6 +255,13 @@ def test_a_body_of_no_size_that_a_person_has_is_not_guessed_at() -> None:
     giant = replace(FAMILIES["LAFAN1"], unit=0.2).joints()
     with pytest.raises(MotionError, match=r"0\.95 to 2\.3 m.*--rig"):
         read_motion("giant.bvh", write_bvh(giant, np.zeros(3), 30.0))
+    _, body = read_motion("giant.bvh", write_bvh(giant, np.zeros(3), 30.0), describe({"metres": 0.2}))
+    assert np.linalg.norm(body[0, J["left_knee"]] - body[0, J["left_ankle"]]) == pytest.approx(0.41, rel=0.01)
+
+
+def test_a_body_without_frames_says_so() -> None:
+    with pytest.raises(MotionError, match="expected frames after MOTION, got none"):
+        read_motion("still.bvh", write_bvh(FAMILIES["LAFAN1"].joints(), np.zeros(3), 30.0, frames=0))
 
 
 def test_helpers_inside_a_bone_are_looked_through() -> None:
@@ -294,6 +301,27 @@ def test_what_is_no_body_is_refused_in_words() -> None:
     other = [replace(j, name=f"B{j.name}", parent=j.parent and f"B{j.parent}") for j in one]
     with pytest.raises(MotionError, match="one body, got limbs below the roots Hips and BHips: export each"):
         recognise(as_tree([*one, *other]))
+
+
+def renamed(**names: str) -> list[Joint]:
+    """LAFAN1's joints, some by other names."""
+    joints = FAMILIES["LAFAN1"].joints()
+    return [replace(j, name=names.get(j.name, j.name), parent=names.get(j.parent or "", j.parent)) for j in joints]
+
+
+def test_a_limb_that_is_named_on_one_side_alone_or_twice_is_not_taken_for_another() -> None:
+    for old, new in (("RightForeArm", "RightForearm"), ("RightLeg", "RightShin")):
+        with pytest.raises(
+            MotionError, match=rf"'{old.replace('Right', 'Left')}' has no counterpart, or there are two"
+        ):
+            recognise(as_tree(renamed(**{old: new})))
+    content = write_bvh(FAMILIES["LAFAN1"].joints(), np.zeros(3), 30.0)
+    for side in (b"Left", b"Right"):
+        content = content.replace(b"JOINT " + side + b"ForeArm", b"JOINT " + side + b"Arm")
+    with pytest.raises(MotionError, match="'LeftArm' has no counterpart, or there are two"):
+        read_motion("twice.bvh", content)
+    table = recognise(as_tree(renamed(RightToe="RightToes"))).skeleton.table
+    assert not {"left_foot", "right_foot"} & table.keys()
 
 
 def test_an_offset_that_the_roots_channels_contain_too_does_not_lift_the_body() -> None:
@@ -353,7 +381,13 @@ def test_a_description_says_what_a_file_does_not() -> None:
 
 @pytest.mark.parametrize(
     ("table", "said"),
-    [({"unit": 1}, "unit"), ({"up": "x"}, "up"), ({"canonical": {"nose": "b"}}, "nose"), ({"metres": "cm"}, "metres")],
+    [
+        ({"unit": 1}, "unit"),
+        ({"up": "x"}, "up"),
+        ({"canonical": {"nose": "b"}}, "nose"),
+        ({"metres": "cm"}, "metres"),
+        ({"metres": -1.0}, "metres and fps above 0, got -1"),
+    ],
 )
 def test_a_description_that_says_something_else_is_refused(table: dict[str, object], said: str) -> None:
     with pytest.raises(MotionError, match=said):
