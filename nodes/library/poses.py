@@ -325,7 +325,7 @@ def sample(name: str = BUNDLED) -> Sample:
     from scipy.interpolate import interp1d  # imported late: it takes a tenth of a second
 
     times = np.array([message.stamp_ns for message in truths])
-    ends = places[0], places[-1]  # the camera's last frame may be a little later than the last truth
-    truth = interp1d(times - times[0], places, axis=0, bounds_error=False, fill_value=ends)(stamps - times[0])
+    known = np.clip(stamps, times[0], times[-1])  # the camera's last frame may be a little later than the last truth
+    truth = interp1d(times - times[0], places, axis=0)(known - times[0])
     alone = len(ids) == len(people) == 1
     return Sample(positions[:, 0], stamps, truth[:, 0]) if alone else Sample(positions, stamps, truth)
