@@ -28,7 +28,6 @@ _MEASURED_BEFORE_PATH = (
     "counter",
     "event_mocap",
     "events",
-    "fidelity",
     "heading",
     "hgvae",
     "hidden_joints",
