@@ -64,11 +64,10 @@ AT_ONCE = 256
 
 _POSITION = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
 _ROTATION = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
-_WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)")
+_WORDS = re.compile(r"(ROOT|JOINT)\s+([^{]*[^{\s])|(\{|[^\s{]+)", re.IGNORECASE)
 """the words of a line; the name of a joint, which may contain spaces, is one"""
-
-
-_MOTION = re.compile(r"(?<!\w)(MOTION)(?!\w)")  # not within a joint's name, such as ROOT_MOTION
+_MOTION = re.compile(r"(?:^|(?<=\}))[ \t]*(MOTION)(?!\S)", re.IGNORECASE | re.MULTILINE)  # not a joint's name
+_FRAMES = re.compile(r"\s*Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,8 @@ class Bvh:
 
 @documented
 def read_bvh(text: str) -> Bvh:
-    """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites.
+    """Read a BVH file: any rotation order, position channels on any joint, several roots and end sites, and keywords in
+    any case.
 
     Raises:
         MotionError: it is no BVH file, or its motion does not match its hierarchy.
@@ -149,23 +149,25 @@ def _hierarchy(text: str) -> list[_Node]:
 
     it = words()
     try:
-        if (first := next(it)) != "HIERARCHY":
+        if (first := next(it)).upper() != "HIERARCHY":
             raise MotionError(f"expected HIERARCHY at the start, found '{first}'")
-        for token in it:
-            if token in ("ROOT", "JOINT", "End"):
+        for word in it:
+            token = word.upper()
+            if token in ("ROOT", "JOINT", "END"):
                 parent = open_joints[-1] if open_joints else -1
-                name = next(it)
-                if token == "End":
+                name, brace = next(it), next(it)
+                if token == "END":
                     ends = sum(n.parent == parent and not n.channels for n in nodes)
                     name = f"{nodes[parent].name}_end{ends + 1 if ends else ''}"
-                if (brace := next(it)) != "{":
-                    raise MotionError(f"expected '{{' after {token} {name}, found '{brace}'")
+                    brace = next(it) if brace != "{" else brace  # some programs name end sites
+                if brace != "{":
+                    raise MotionError(f"expected '{{' after {word} {name}, found '{brace}'")
                 open_joints.append(len(nodes))
                 nodes.append(_Node(name, parent, (0.0, 0.0, 0.0)))
             elif token == "OFFSET":
                 nodes[open_joints[-1]].offset = (float(next(it)), float(next(it)), float(next(it)))
             elif token == "CHANNELS":
-                channels = tuple(next(it) for _ in range(int(next(it))))
+                channels = tuple(next(it).capitalize() for _ in range(int(next(it))))
                 unknown = set(channels) - _POSITION.keys() - _ROTATION.keys()
                 if unknown:
                     raise MotionError(f"joint {nodes[open_joints[-1]].name}: unknown channels {sorted(unknown)}")
@@ -173,7 +175,7 @@ def _hierarchy(text: str) -> list[_Node]:
             elif token == "}":
                 open_joints.pop()
             else:
-                raise MotionError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{token}'")
+                raise MotionError(f"expected ROOT, JOINT, End, OFFSET, CHANNELS or '}}', found '{word}'")
         if open_joints or not nodes:
             raise StopIteration
     except (StopIteration, IndexError) as error:
@@ -193,17 +195,17 @@ def _numbers(text: str) -> NDArray[np.float64]:
     """All numbers of a text, a few lines at a time."""
     lines = text.splitlines()
     parts = (lines[k : k + AT_ONCE] for k in range(0, len(lines), AT_ONCE))
-    return np.concatenate([np.array(" ".join(part).split(), np.float64) for part in parts])
+    return np.concatenate([np.empty(0), *(np.array(" ".join(part).split(), np.float64) for part in parts)])
 
 
 def _motion(text: str, channels: int, last: int) -> tuple[NDArray[np.float64], float]:
     """Return values (T, channels), and frames per second. ``last`` is the number of the file's last line."""
-    words = text.split(maxsplit=5)
-    if [word.lower() for word in words[:1] + words[2:4]] != ["frames:", "frame", "time:"] or len(words) < 5:
-        raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{' '.join(words[:5])}'")
+    if not (stated := _FRAMES.match(text)):
+        found = " ".join(text[:200].split()[:5])
+        raise MotionError(f"expected 'Frames: N' and 'Frame Time: S' after MOTION, found '{found}'")
     try:
-        frames, seconds = int(words[1]), float(words[4])
-        values = _numbers(words[5]) if len(words) > 5 else np.empty(0)
+        frames, seconds = int(stated[1]), float(stated[2])
+        values = _numbers(text[stated.end() :])
     except ValueError as error:
         raise MotionError(_unread("motion", error)) from error
     if not 0 < seconds < np.inf:

@@ -52,7 +52,7 @@ def test_a_damaged_file_is_read_or_is_a_motion_error(kind: str, data: st.DataObj
     ("bvh", "HIERARCHY", "", "expected HIERARCHY"),
     ("bvh", "OFFSET 1 2 3", "OFFSET 1 two 3", "line 4: a number in the hierarchy"),
     ("bvh", r"\}\nMOTION", "MOTION", "line 18: .* braces"),
-    ("bvh", "JOINT.*MOTION", "MOTION", "line 6: the hierarchy is cut short"),
+    ("bvh", "JOINT.*MOTION", "MOTION", "line 5: the hierarchy is cut short"),
     ("bvh", r"HIERARCHY.*MOTION", "HIERARCHY\nMOTION", "line 1: the hierarchy is cut short"),
     ("bvh", "Xrotation", "Wrotation", "unknown channels"),
     ("bvh", "Frames: 1", "Frames: 2", "expected 2 frames of 12 numbers, found 12 .* on line 23; .* cut short"),

@@ -60,6 +60,19 @@ def test_motion_within_a_name_does_not_begin_the_motion() -> None:
     assert read_bvh(bvh_text().replace("ROOT hip", "ROOT ROOT_MOTION")).joints[0] == "ROOT_MOTION"
 
 
+@pytest.mark.parametrize("written", [
+    bvh_text().lower(),
+    bvh_text().upper(),
+    bvh_text().replace("End Site", "End Site Tip"),
+    bvh_text().replace("Frames: ", "Frames:").replace("Time: ", "Time:"),
+    bvh_text().replace("\nMOTION", " MOTION"),
+])  # fmt: skip
+def test_keywords_are_read_however_a_program_writes_them(written: str) -> None:
+    bvh, expected = read_bvh(written), read_bvh(bvh_text())
+    assert [joint.lower() for joint in bvh.joints] == list(expected.joints)
+    np.testing.assert_array_equal(bvh.positions(), expected.positions())
+
+
 def test_a_frame_time_that_is_none_is_refused() -> None:
     with pytest.raises(MotionError, match="expected a frame time above zero, found inf"):
         read_bvh(re.sub("Frame Time: .*", "Frame Time: inf", bvh_text()))
