@@ -87,12 +87,15 @@ def open_recording(path: str | Path, rig: Mapping[str, Any] = NO_RIG, image_file
         if len(path.parts) == 1 and not path.suffix:
             hint = hint or nearest(path.name, (p.name for p in (PACKAGE / STREAMS).iterdir() if p.is_dir()))
         raise LaunchError(f"{path} does not exist: expected a rosbag2 directory, an .mcap, {_FILES}, or a video{hint}")
+    motion = holds_motion(path)
+    if rig and not motion:
+        raise LaunchError(f"{path}: expected a motion capture file beside --rig, which describes one; leave --rig out")
     if path.suffix.lower() in VIDEOS:
         require_extra("webcam")
         from steadypose.nodes.sources.webcam_device import VideoSource  # OpenCV
 
         return VideoSource(WebcamSettings(video=str(path)), CalibrationSettings(), image_file=image_file)
-    if holds_motion(path):
+    if motion:
         return MotionSource(path, rig)
     if path.is_file() and path.suffix not in (".npz", ".csv", ".mcap"):
         remedy = "; export its animation as .bvh" if path.suffix.lower() in ANIMATIONS else ""
