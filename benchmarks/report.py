@@ -23,7 +23,6 @@ from steadypose.benchmarks.results import load
 _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints that are observed in it are now nearer"
 _PATH = "measured before HG-VAE's path followed fast motion of the whole body, on which joints here hardly depend"
 _MEASURED_BEFORE_PATH = (
-    "ablations",
     "contacts",
     "counter",
     "event_mocap",
@@ -31,7 +30,6 @@ _MEASURED_BEFORE_PATH = (
     "heading",
     "hgvae",
     "hidden_joints",
-    "kinect_vicon",
     "layouts",
     "mediapipe",
     "noisy_joints",
