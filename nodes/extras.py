@@ -72,7 +72,8 @@ def upgrade_and_uninstall() -> str:
         f"upgrade:   {upgrade}\n"
         f"uninstall: {uninstall}; before that, if you installed a service,\n"
         "           sudo steadypose install-service --uninstall\n\n"
-        "Outside the paths that you name, steadypose writes only compiled code beside the package, and sockets.\n"
+        "Outside the working folder and the paths that you name, steadypose writes only\n"
+        "compiled code, beside the package or to ~/.cache, and files beside its sockets.\n"
         "CHANGELOG.md in the checkout says what has changed."
     )
 

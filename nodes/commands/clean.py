@@ -67,8 +67,8 @@ def clean(
         rig: TOML file that describes motion capture which is not recognised: metres (length of its unit), up, fps,
             skeleton (of .npy), and [canonical], which names its joint for each of smpl22 (docs/sources.md).
         events: .csv file for what the people do: one row per event, with its begin and end (docs/events.md).
-        jobs: for a folder, how many recordings to clean at once. Each takes about 1 GB of memory. Default: the
-            number of cores.
+        jobs: for a folder, how many recordings to clean at once. Each takes 0.3 GB of memory, more if it lasts long.
+            Default: the number of cores.
         ray: clean a folder on a Ray cluster: the one of this machine or of RAY_ADDRESS, or else a new local one. All
             its machines must see IN and OUT under the same paths. Needs the extra 'ray'.
         force: replace OUT if it is a recording, an .npz or a .csv, and the .csv of --events. In a folder, results of

@@ -43,7 +43,7 @@ def complete(
     A joint is missing in a frame if it is NaN or has confidence 0. A frame is missing between stamps more than 1/20 s
     apart. Known joints stay unchanged, so clean a noisy recording first: steadypose clean IN CLEAN.
 
-    OUT has one frame every 1/30 s from the first stamp to the last, interpolated if the input has another rate.
+    OUT has one frame every 1/30 s from the first observation to the last, interpolated if the input has another rate.
     Completed joints have the state IMPUTED, and a standard deviation that grows with the time to the nearest
     observation. Gaps of up to two seconds get plausible motion, longer ones less so. After 8 s without any joint, a new
     segment begins.

@@ -109,8 +109,8 @@ def retarget(
 ) -> int:
     """Clean a recording, and convert the person's motion to that of a robot.
 
-    Joints respect the position and velocity limits of the URDF, and standing feet do not slide. If there are several
-    people, the robot follows one at a time. The exit status is 1 if OUT cannot be trusted, as for `clean`.
+    Joints respect the position and velocity limits of the URDF, and standing feet are held in place. If there are
+    several people, the robot follows one at a time. The exit status is 1 if OUT cannot be trusted, as for `clean`.
 
     Try:
       steadypose retarget walk_turn walk.csv --urdf launch/robots/humanoid29.urdf

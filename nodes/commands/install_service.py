@@ -182,8 +182,8 @@ def install_service(
         name: name of the service and of its folders.
         user: existing user to run it as. Default: a new user with the service's name.
         dry_run: print every step and do nothing.
-        uninstall: stop and remove the service, its compiled code, and its user if it was created for it. Recordings in
-            /var/lib/NAME are kept.
+        uninstall: stop and remove the service and its compiled code. Recordings in /var/lib/NAME are kept; if there
+            are none, its user is removed too, if it was created for it.
     """
     console = Console(highlight=False, soft_wrap=True)
     if uninstall:
