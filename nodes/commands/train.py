@@ -52,9 +52,9 @@ def train(
 ) -> None:
     """Train a model of the prior on prepared motion.
 
-    Training takes about an hour on two cores. It shows progress and draws curves. If it is killed, the same command
-    resumes it. The folder runs/MODEL-SET gets the weights and a card that describes how they were made. To use them,
-    put their path into a launch file, or replace the bundled weights with --install.
+    Training takes seconds (posture) to hours (completer: eight) on two cores. It shows progress and draws curves. If it
+    is killed, the same command resumes it. The folder runs/MODEL-SET gets the weights and a card that describes how
+    they were made. To use them, put their path into a launch file, or replace the bundled weights with --install.
 
     To train on several processes or machines, use torchrun:
     `torchrun --nproc-per-node 2 -m steadypose.nodes.cli train hmvae`.
