@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from steadypose.msgs.types import Level, Pose, PoseRaw, RawBody
-from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, warning
-from steadypose.prior.body.layouts import SKELETONS, Skeleton
+from steadypose.msgs.types import JOINTS, Level, Pose, PoseRaw, RawBody
+from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, tracks, warning
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
 from steadypose.prior.body.likeness import likenesses
+from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.admission import MAX_PLACE
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.settings import nearest
@@ -53,7 +54,7 @@ def check_layout(messages: Sequence[PoseRaw], settings: PriorSettings) -> Iterat
         return
     few = some_bodies(messages)
     yield from _confidence(few, settings.gate.min_confidence)
-    yield from _seen(few)
+    yield from _seen(few, skeleton)
     yield from _ids(messages, settings.max_bodies, settings.identify.enabled)
 
 
@@ -127,14 +128,15 @@ def _confidence(messages: Sequence[PoseRaw], needed: float) -> Iterator[Problem]
         yield warning("confidence_low", f"confidence is {most:.2g} at most: {expected}; {remedy}")
 
 
-def _seen(messages: Sequence[PoseRaw]) -> Iterator[Problem]:
+def _seen(messages: Sequence[PoseRaw], skeleton: Skeleton) -> Iterator[Problem]:
     from steadypose.prior.clean.slots import MIN_JOINTS  # imported late: loads 95 MB of numba
 
-    seen = [int(np.isfinite(body.positions).all(axis=1).sum()) for body in bodies(messages)]
-    if seen and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
+    joints, _ = to_canonical(skeleton, tracks(messages, len(skeleton.joints)))
+    seen = finite_joints(joints).sum(axis=1)
+    if len(seen) and 0 < (usual := int(np.median(seen))) < MIN_JOINTS:
         remedy = "get the whole body into the image, or lower the tracker's own threshold"
-        got = f"only {usual} of a body's joints are observed"
-        yield warning("few_joints", f"{got}, the others are NaN: expected {MIN_JOINTS} or more; {remedy}")
+        got = f"only {usual} of a body's {len(JOINTS)} joints are observed"
+        yield warning("few_joints", f"{got}: expected {MIN_JOINTS} or more; {remedy}")
 
 
 def _ids(messages: Sequence[PoseRaw], max_bodies: int, identified: bool) -> Iterator[Problem]:

@@ -252,6 +252,19 @@ def test_a_good_stream_has_no_problem(name: str) -> None:
         assert not judge([message for _, message in played if isinstance(message, PoseRaw)], live=False)
 
 
+@pytest.mark.parametrize("face", [False, True])
+def test_few_joints_are_counted_among_the_22(face: bool) -> None:
+    names = SKELETONS["coco17"].joints
+    given = [name for name in names if name.endswith(("nose", "eye", "ear") if face else ("hip", "shoulder"))]
+    some = joints(lambda it: np.where(np.isin(names, given)[:, None], it, np.nan))
+    check, frames = StreamCheck(PriorSettings()), walk(layout="coco17")
+    for index, raw in enumerate(frames):
+        check.see(some(raw, index), raw.stamp_ns)
+    found = check.problems(frames[-1].stamp_ns, live=False)
+    # pelvis and neck follow from hips and shoulders; of five points of the face, only a head
+    assert [problem.cause for problem in found] == (["few_joints"] if face else [])
+
+
 def test_the_origin_between_the_hips_of_a_layout_without_pelvis_is_the_root() -> None:
     hips = [SKELETONS["blazepose33"].joints.index(f"{side}_hip") for side in ("left", "right")]
     centred = joints(lambda it: it - it[hips].mean(axis=0))
