@@ -5,34 +5,30 @@ statement left out. Tests that fail on it kill it. If all of them pass, it survi
 there. Each mutant is printed as killed or survived.
 
 Unless ``--tests`` names the tests, each mutant is tested by the test files in the folder of its file, such as
-``tests/prior/fit`` for ``prior/fit``. If none of them imports its module, those elsewhere that do are added, or, if
-there are none, those that import a module that imports it. Only those that run the changed function are run, the
-fastest first, without tests marked slow. Mutants are written to a temporary copy of the checkout. The exit status is 0
-if at least `GOAL` of the mutants were killed, and 1 if fewer were, or if the tests fail on the unchanged code.
+``tests/prior/fit`` for ``prior/fit``, those that import its module first. If none of them does, those elsewhere that do
+are added, or, if there are none, those that import a module that imports it. Tests marked slow are left out. Mutants
+are written to a temporary copy of the checkout. The exit status is 0 if at least `GOAL` of the mutants were killed, and
+1 if fewer were, or if the tests fail on the unchanged code.
 """
 
 import ast
 import copy
-import hashlib
-import json
 import multiprocessing
 import os
 import random
 import shutil
 import sys
 import tempfile
-import threading
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from types import FrameType
-from typing import NamedTuple
 
 import pytest
-from tests.aims import FOLDERS, runs_of, tests_in_folder, tests_of_module
 
+FOLDERS = ("msgs", "prior", "training", "nodes", "benchmarks")
 ROOT = Path(__file__).parents[1]
 GOAL = 0.85
 """Least share of mutants that tests should kill."""
@@ -145,6 +141,42 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
             return
 
 
+@cache
+def tests_of(file: Path) -> list[str]:
+    """Return the test files of a file's module, those that import it first; all are relative to `ROOT`.
+
+    Raises ValueError if no test imports the module, even through others.
+    """
+    modules = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for folder in FOLDERS
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    tests = {path: _imports(path) for path in sorted((ROOT / "tests").rglob("test_*.py"))}
+    near = sorted((ROOT / "tests" / file.parent).glob("test_*.py"))
+    sought, seen = {name for name, path in modules.items() if path == ROOT / file}, set()
+    while sought:
+        found = [path for path, names in tests.items() if names & sought]
+        if found:
+            first = [path for path in found if path in near] or found
+            return [str(path.relative_to(ROOT)) for path in dict.fromkeys([*first, *near])]
+        seen |= sought
+        sought = {name for name, path in modules.items() if name not in seen and _imports(path) & sought}
+    raise ValueError(f"{file}: expected a module that a test imports, directly or through others")
+
+
+@cache
+def _imports(path: Path) -> set[str]:
+    """Return the modules of the package that a file imports, and the names that it imports from them, without
+    ``steadypose.``"""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("steadypose."):
+            module = (node.module or "").removeprefix("steadypose.")
+            names |= {module, *(f"{module}.{alias.name}" for alias in node.names)}
+    return names
+
+
 def copy_checkout(source: Path, target: Path) -> None:
     """Copy what the tests of a checkout need, without data, results and caches."""
 
@@ -154,16 +186,15 @@ def copy_checkout(source: Path, target: Path) -> None:
     shutil.copytree(source, target, symlinks=True, ignore=left_out)
 
 
-def passes(tests: Sequence[str], root: Path, limit_s: float | None = None, record: Path | None = None) -> bool:
+def passes(tests: Sequence[str], root: Path, limit_s: float | None = None) -> bool:
     """Return whether the tests (arguments of pytest) pass on the copy of the checkout at ``root`` within ``limit_s``.
 
-    ``record`` is a file for the functions that they ran, JSON pairs of file and first line. Raises ValueError if pytest
-    finds no such tests.
+    Raises ValueError if pytest finds no such tests.
     """
     # fork from a process that has already imported the libraries, because importing them takes longer than most tests
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(LIBRARIES)
-    child = context.Process(target=_run, args=(tests, root, record))
+    child = context.Process(target=_run, args=(tests, root))
     child.start()
     child.join(limit_s)
     if child.is_alive():
@@ -174,7 +205,7 @@ def passes(tests: Sequence[str], root: Path, limit_s: float | None = None, recor
     return child.exitcode in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)  # none, where all are slow
 
 
-def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
+def _run(tests: Sequence[str], root: Path) -> None:
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     os.chdir(root)
@@ -183,32 +214,7 @@ def _run(tests: Sequence[str], root: Path, record: Path | None) -> None:
     sys.dont_write_bytecode = True
     os.environ |= {"PYTHONPATH": str(root / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
     os.environ.setdefault("NUMBA_CACHE_DIR", str(LOOPS))  # only loops that are changed are compiled
-    ran: set[tuple[str, int]] = set()
-
-    def note(frame: FrameType, event: str, arg: object) -> None:
-        ran.add((frame.f_code.co_filename, frame.f_code.co_firstlineno))
-
-    if record:
-        threading.settrace(note)
-        sys.settrace(note)
-    status = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests])
-    sys.settrace(None)
-    if record:
-        within = [(Path(name).resolve(), line) for name, line in ran]
-        record.write_text(json.dumps([(str(f.relative_to(root)), n) for f, n in within if f.is_relative_to(root)]))
-    sys.exit(status)
-
-
-class Unchanged(NamedTuple):
-    """A run of a test file on the unchanged code: file and first line of each function that it ran."""
-
-    seconds: float
-    ran: list[list[str | int]]
-
-
-def _digest(*paths: Path) -> str:
-    files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+    sys.exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests]))
 
 
 def main() -> int:
@@ -218,39 +224,27 @@ def main() -> int:
     parser.add_argument("--tests", nargs="+", help="arguments of pytest; if omitted, chosen for each mutant")
     parser.add_argument("--sample", type=int, help="number of mutants, drawn at random; all if omitted")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kept", type=Path, help="file that keeps which functions each test file runs")
     options = parser.parse_args()
     paths = [path.resolve() for path in options.code]
     files = [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
     every = [mutant for file in files for mutant in mutants(file.relative_to(ROOT))]
     drawn = random.Random(options.seed).sample(every, min(options.sample or len(every), len(every)))
     drawn.sort(key=lambda mutant: mutant.file)
+    survived, seconds = 0, dict[str, float]()
     with tempfile.TemporaryDirectory() as temporary:
-        root, record = Path(temporary).resolve() / "checkout", Path(temporary) / "ran.json"
+        root = Path(temporary).resolve() / "checkout"
         copy_checkout(ROOT, root)
-        code = _digest(*(root / folder for folder in FOLDERS))
-        survived, unchanged = 0, dict[str, Unchanged]()
-        if options.kept and options.kept.is_file():
-            unchanged = {key: Unchanged(*value) for key, value in json.loads(options.kept.read_text()).items()}
         for mutant in drawn:
-            tests = options.tests or [*tests_of_module(mutant.file, ROOT), *tests_in_folder(mutant.file, ROOT)]
-            known = {test: f"{test} {_digest(root / test.partition('::')[0])} {code}" for test in tests}
-            for test, key in known.items():
-                if key not in unchanged:
+            tests = options.tests or tests_of(mutant.file)
+            for test in tests:
+                if test not in seconds:
                     started = time.monotonic()
-                    if not passes([test], root, record=record):
+                    if not passes([test], root):
                         sys.exit(f"{test} fails on the unchanged code, so it can say nothing of mutants")
-                    unchanged[key] = Unchanged(time.monotonic() - started, json.loads(record.read_text()))
-                    if options.kept:
-                        options.kept.write_text(json.dumps(unchanged))
-            seconds = {test: unchanged[key].seconds for test, key in known.items()}
-            changed = [list(place) for place in runs_of(mutant.file, mutant.line, ROOT)]
-            chosen = [test for test, key in known.items() if any(place in unchanged[key].ran for place in changed)]
-            # if none is known to run the function, run all: what runs in other processes is not recorded
-            chosen = sorted(chosen or known, key=seconds.__getitem__)
+                    seconds[test] = time.monotonic() - started
             original = (root / mutant.file).read_bytes()
             (root / mutant.file).write_bytes(mutant.source)
-            alive = passes(chosen, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in chosen))
+            alive = passes(tests, root, limit_s=10.0 + 3.0 * sum(seconds[test] for test in tests))
             (root / mutant.file).write_bytes(original)
             survived += alive
             print("survived" if alive else "killed  ", mutant, flush=True)

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 import pytest
-from tests import aims, mutation
+from tests import mutation
 
 CODE = '''"""Text."""
 import os
@@ -36,35 +36,6 @@ def test_every_place_that_a_test_can_hold_is_changed_once(tmp_path: Path) -> Non
     for mutant in found:
         compile(mutant.source, "m.py", "exec")
         assert mutant.source.decode() != CODE
-
-
-USED = """LIMIT = 2
-WIDE = 2 * LIMIT
-
-
-@njit(cache=True)
-def loop(x):
-    return x + WIDE
-
-
-class A:
-    size = 5
-
-    @property
-    def runs(self):
-        return loop(1) + 4
-
-
-def other():
-    return 3
-"""
-
-
-@pytest.mark.parametrize(("line", "first"), [(1, 13), (2, 13), (15, 13), (11, 1), (19, 18)])
-def test_a_change_shows_in_the_functions_that_use_it(line: int, first: int, tmp_path: Path) -> None:
-    (tmp_path / "prior").mkdir()
-    (tmp_path / "prior" / "m.py").write_text(USED)
-    assert aims.runs_of(Path("prior/m.py"), line, tmp_path) == {("prior/m.py", first)}
 
 
 def test_a_copy_has_all_code_and_nothing_that_was_made(tmp_path: Path) -> None:
