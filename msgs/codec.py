@@ -1,7 +1,5 @@
 """Encodes and decodes messages as CDR, ROS 2's wire format, by the definitions in `msgs/msg`."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Mapping
 from functools import cache

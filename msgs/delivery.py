@@ -16,8 +16,6 @@ name. It receives the messages that its predecessor had not acknowledged, preced
 requests as context.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 from collections import Counter, OrderedDict, deque

@@ -1,7 +1,5 @@
 """Forms of message fields: each converts and checks the value that a constructor is given."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple

@@ -7,8 +7,6 @@ and the number of records per chunk, are limited, so that a small malicious file
 the processor busy.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 import struct

@@ -3,8 +3,6 @@
 In the file, a topic has its ROS name (`/pose/raw` for `pose/raw`), and a message's log time is its stamp.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections import Counter

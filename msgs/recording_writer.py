@@ -7,8 +7,6 @@ the operating system at that interval. The file then has no index, and the direc
 `RecordingReader` rebuilds the index; a writer with `go_on` starts the next part.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import time

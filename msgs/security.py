@@ -12,8 +12,6 @@ directory of keys defines who may subscribe. It contains:
   hosts are then not subscribed to.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import socket

@@ -1,7 +1,5 @@
 """The subscriber: receives messages from publishers."""
 
-from __future__ import annotations
-
 import math
 import os
 import struct

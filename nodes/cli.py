@@ -4,8 +4,6 @@ A subcommand is a typed function with a docstring. Its module is imported only w
 `steadypose --help` and subcommands without torch never wait for torch.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os

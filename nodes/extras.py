@@ -1,7 +1,5 @@
 """The optional extras: the purpose of each, and the modules that it installs."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Shared by the settings of all packages: their error, and checks of paths, addresses and plugins."""
 
-from __future__ import annotations
-
 import importlib
 import os
 from collections.abc import Iterator

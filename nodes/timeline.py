@@ -1,7 +1,5 @@
 """Events with begin and end: those of each frame, and those of a whole stream, each once."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Without torchrun there is one process, and these functions have no effect: `rank
 The backend is gloo, because the models train on CPUs.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Writes trained weights with a card of their provenance, and installs them where nodes look for them."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

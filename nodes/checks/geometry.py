@@ -1,7 +1,5 @@
 """Checks of joint positions: a human body, in metres, upright, not mirrored, moving at plausible speed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Checks of layouts, joint counts, confidences and ids; and hints for arrays of the wrong shape."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Shared by all checks: `Problem`, as reported by `diagnostics`, the console and `steadypose doctor --live`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

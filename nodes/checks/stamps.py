@@ -1,7 +1,5 @@
 """Checks of stamps: nanoseconds, of capture, increasing, and close to the present."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """All checks of a stream of ``pose/raw``, and of the prior's output for it."""
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter, deque
 from collections.abc import Iterator

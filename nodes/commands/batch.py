@@ -5,8 +5,6 @@ that is done is not cleaned again, unless it, the settings or the models have ch
 resumed, and one with new recordings does these.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """``steadypose calibrate``: a camera's lens, and where it stands in the world, into its launch file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Files of `calibrate`: images, read and drawn with the estimated floor, and the launch file that is written."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``steadypose clean``: one recording, or a folder of them."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import tyro

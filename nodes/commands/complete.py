@@ -1,7 +1,5 @@
 """``steadypose complete``: key frames to motion, a part of a body to all of it."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import tyro

@@ -1,7 +1,5 @@
 """``steadypose export`` and ``retarget``: cleaned motion for other programs, and for robots."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

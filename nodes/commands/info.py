@@ -1,7 +1,5 @@
 """``steadypose info``: what is in a recording or a file of poses, or who publishes a topic."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from datetime import datetime, timezone

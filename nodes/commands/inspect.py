@@ -4,8 +4,6 @@ A topic is looked for where this machine's nodes publish it; ``--launch`` takes 
 file in place of these, ``--endpoint`` an address of one's own. Nothing here holds the nodes up.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

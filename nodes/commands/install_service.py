@@ -1,7 +1,5 @@
 """``steadypose install-service``: a launch file at every boot, under systemd; and how to undo it."""
 
-from __future__ import annotations
-
 import grp
 import os
 import pwd

@@ -1,7 +1,5 @@
 """``steadypose node``: one node in this process."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 One recording is cleaned here, for `clean` and for each process of a folder's.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """``steadypose prepare``: motion capture to training data, with nothing refused silently."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

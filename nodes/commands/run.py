@@ -1,7 +1,5 @@
 """``steadypose run``: a launch file's nodes as processes, and a live table of how they do."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import secrets

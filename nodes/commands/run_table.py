@@ -1,7 +1,5 @@
 """The table of a run: how fast, how late, what went wrong, of each node."""
 
-from __future__ import annotations
-
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text

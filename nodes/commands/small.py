@@ -1,7 +1,5 @@
 """Commands of one call each: ``keys``, ``repair``, ``simulate`` and ``plot``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``steadypose train``: reproduce the weights that ship, or train on motion of one's own."""
 
-from __future__ import annotations
-
 import sys
 import zipfile
 from importlib import import_module

@@ -1,7 +1,5 @@
 """The events node: ``pose/world`` in, ``pose/events`` out."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

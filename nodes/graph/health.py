@@ -1,7 +1,5 @@
 """A node's self-measurements for `diagnostics`: rates, latency, queue length, dropped and refused messages."""
 
-from __future__ import annotations
-
 import resource
 import sys
 from collections import Counter, deque

@@ -1,7 +1,5 @@
 """Overload handling of a node: a queue that drops the oldest frames, and a limit on the number of bodies."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ backwards. They share the compiled loops through the cache on disk.
 ``python -I -m steadypose.nodes.graph.loops`` does only this.
 """
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import os

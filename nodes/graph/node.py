@@ -16,8 +16,6 @@ stamps.
 **Bad input.** Unusable input is counted by cause and reported. It never stops a node.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

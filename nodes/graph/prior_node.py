@@ -1,7 +1,5 @@
 """The prior node: ``pose/raw`` in, ``pose/clean`` out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

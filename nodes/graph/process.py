@@ -1,7 +1,5 @@
 """Our own processes: safe start, release of start-up memory, signals, and systemd notifications."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

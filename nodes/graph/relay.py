@@ -9,8 +9,6 @@ A node's progress is a few bytes in the directory of the sockets, written whenev
 reliable subscribers. It is valid only for nodes of the same supervisor; a new run starts from the beginning.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections import deque

@@ -1,7 +1,5 @@
 """State that ``steadypose run`` keeps: locks of the nodes' addresses, message counts, ``health.json``."""
 
-from __future__ import annotations
-
 import dataclasses
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """Runs nodes as processes: starts and monitors them, restarts them when they crash or hang, stops them in order."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

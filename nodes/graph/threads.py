@@ -1,7 +1,5 @@
 """Single-threaded BLAS for a process whose matrices are small."""
 
-from __future__ import annotations
-
 import sys
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec

@@ -6,8 +6,6 @@ An entry names classes as ``module:name`` instead of importing them, so that rea
 command's help imports none of the nodes' libraries.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The trajectory node: ``pose/clean`` in, ``pose/world`` out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Frame by frame: the nodes `prior` and `trajectory` as one object, for programs with joints of their own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

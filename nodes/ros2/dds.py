@@ -12,8 +12,6 @@ Fast DDS 2 (Jazzy) works.
 # pyright: reportMissingImports=false
 # an optional extra that may not be installed
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable

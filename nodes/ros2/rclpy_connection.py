@@ -3,8 +3,6 @@
 # pyright: reportMissingImports=false
 # rclpy is installed with ROS
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any

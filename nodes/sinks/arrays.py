@@ -8,8 +8,6 @@ state is UNKNOWN; unknown contacts are NaN too. For several bodies, an axis of b
 lists their ids.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping

@@ -3,8 +3,6 @@
 VMC (Virtual Motion Capture) is a protocol of OSC over UDP, for avatars in Unity, Unreal and others.
 """
 
-from __future__ import annotations
-
 import socket
 from abc import abstractmethod
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Shared by the viewer and the plots: colours, bones, and the transform to the world."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation

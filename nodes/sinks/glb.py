@@ -5,8 +5,6 @@ The skin makes the bones visible. A VRM animation (.vrma) is the same file with 
 extension that maps nodes to a humanoid's bones (VRMC_vrm_animation 1.0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ It can run for months: it splits the recording into parts and removes the oldest
 it drops and counts messages. After a restart it continues with the next part.
 """
 
-from __future__ import annotations
-
 import errno
 import itertools
 import logging

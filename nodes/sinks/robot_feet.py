@@ -1,7 +1,5 @@
 """Where a robot's foot should be: where the person's is, or held flat on the floor while that foot stands."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ hold in every frame. Only bounds are constraints, which makes the program fast.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 # an optional extra that may not be installed; MuJoCo's module has no stubs
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ resolve to this machine (DNS rebinding). Poses of people therefore require a tok
 are refused.
 """
 
-from __future__ import annotations
-
 import hmac
 import ipaddress
 import socket

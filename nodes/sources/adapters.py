@@ -4,8 +4,6 @@ They do not import the trackers' packages: any object with the right attributes 
 axis of its frame points up. For a calibrated camera, set ``sensor_pose`` and ``calibrated`` of the result.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

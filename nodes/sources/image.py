@@ -3,8 +3,6 @@
 It is a file and not a message, so that images of people appear in no recording and on no network.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

@@ -8,8 +8,6 @@ camera); ``camera_height``, metres above the floor; ``points`` (T, N, 3) metres 
 body's surface from a depth camera.
 """
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

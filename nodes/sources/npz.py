@@ -8,8 +8,6 @@ For several bodies: ``positions`` (T, B, J, 3), all NaN where a body is absent; 
 ``body_id`` (B,), their ids (default 0, 1, …).
 """
 
-from __future__ import annotations
-
 import difflib
 import logging
 import zipfile

@@ -1,7 +1,5 @@
 """The input node: publishes a source's skeletons at their capture rate, at another rate, or as fast as possible."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import closing

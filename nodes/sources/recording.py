@@ -1,7 +1,5 @@
 """Recorded sources: rosbag2 directory, ``.mcap``, ``.npz``, ``.csv``, motion capture file, or video."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import difflib

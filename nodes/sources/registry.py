@@ -1,8 +1,6 @@
 """Declares every source once. To add a source, write a module with its settings and class, and
 add a field to `InputSettings` and an entry to `SOURCES`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

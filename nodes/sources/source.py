@@ -1,7 +1,5 @@
 """Shared by all sources of skeletons: the interfaces of recorded and live sources, and the settings of cameras."""
 
-from __future__ import annotations
-
 import logging
 import math
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Webcams and videos by OpenCV: undistorts the images, and detects skeletons in them by MediaPipe."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -6,8 +6,6 @@ skeleton. Figures in comments are centimetres above the hips; the rest skeleton 
 31.5, spine3 37.5, collar 48.5, shoulder 51.5, neck 57.5, head 68.5.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

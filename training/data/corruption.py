@@ -4,8 +4,6 @@ As in `prior.clean.frame.SensorNoise`, a sensor's error has two parts: jitter, i
 bias, constant or slowly varying. Windows are (B, T, 22, 3) metres, and are not changed in place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

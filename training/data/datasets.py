@@ -4,8 +4,6 @@ If subjects are known, people are held out, never random frames or clips: otherw
 people of its training. Each person is in only one split.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Converts recordings to training data: complete bodies at 30 Hz on a floor, checked, labelled and split."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Of UI-PRMD it also reads the Kinect beside the Vicon, our only source of real no
 2018, "A data set of human body movements for physical rehabilitation exercises", Data 3(1):2).
 """
 
-from __future__ import annotations
-
 import tarfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Layers of graphs with learned adjacency and of attention, and the completion and fault networks of HG-VAE."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

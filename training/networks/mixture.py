@@ -14,8 +14,6 @@ The network computes gates that smooth its outputs over time (as in gated recurr
 fluctuating weights would add noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -9,8 +9,6 @@ Clips of true motion are passed once through simulated sensors and the live node
 then drawn and turned, and lose entries that a sensor may lack: the root, the ground, joints.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

@@ -6,8 +6,6 @@ other half simulates a camera. Entries are hidden and completed by the completio
 at the posterior means. One pass then denoises and completes a window, with a standard deviation.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import asdict, replace

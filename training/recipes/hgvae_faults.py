@@ -3,8 +3,6 @@
 Inputs are as in the live node: a sensor with a given error, half of it bias, and some joints missing.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from pathlib import Path

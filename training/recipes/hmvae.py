@@ -1,7 +1,5 @@
 """Training of the refinement model, HM-VAE (section 3.2 and 5 of the paper)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ position error (mm) and acceleration error (mm/frame²). Each clip's errors are 
 expert, so that no kind of sensor or motion dominates. The standard deviation is trained by its likelihood.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import NamedTuple

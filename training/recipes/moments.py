@@ -4,8 +4,6 @@ They are the Gaussian of postures (``steadypose train posture``) and the covaria
 (``steadypose train body_modes --data MOCAP``).
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

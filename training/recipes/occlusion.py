@@ -8,8 +8,6 @@ Clips of true motion pass through simulated sensors, lose joints, and pass throu
 features of its occluded joints, with the truth, are the training data.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path

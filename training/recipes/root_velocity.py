@@ -5,8 +5,6 @@ and velocities, turned to the body's heading; the official code lets the network
 so it adds no delay. It also predicts the velocity's standard deviation and, in training only, HuMoR's eight contacts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple

@@ -5,8 +5,6 @@ error is bias. It depends on the pose, on self-occlusion and on the view directi
 network predicts the correction of each joint, frame by frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence

@@ -1,7 +1,5 @@
 """A recording as arrays per body and topic, one row per message; and its errors against the ground truth, if any."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """``steadypose plot --video --over``: the skeletons of a video, raw beside clean, drawn over its images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Converts ``pose/world`` and ``diagnostics`` to ROS 2 messages of standard types, and assigns their topics."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol

@@ -9,8 +9,6 @@ torso is rigid and bends only forwards, at the pelvis; whose elbows and knees ar
 are fixed in torso and body.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -4,8 +4,6 @@ It only subscribes, so it does not affect the poses. `PoseView` turns messages i
 last minutes of drawings, and serves them with the page.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
