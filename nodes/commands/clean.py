@@ -5,21 +5,9 @@ from typing import Annotated, Any
 import tyro
 from rich.progress import Progress
 
+from steadypose.nodes.commands import output
 from steadypose.nodes.commands.batch import clean_folder, is_folder_of_recordings
-from steadypose.nodes.commands.output import (
-    NO_POSE,
-    UNTRUSTED,
-    File,
-    In,
-    Out,
-    check_file,
-    check_format,
-    check_output,
-    clean_recording,
-    console,
-    plural,
-    print_faults,
-)
+from steadypose.nodes.commands.output import File, In, Out
 from steadypose.nodes.graph.launch import apply_override, check_settings, full_key, pipeline_sections, read_toml
 from steadypose.nodes.graph.loops import compile_missing
 from steadypose.nodes.settings import LaunchError, launch_errors, printable
@@ -86,13 +74,13 @@ def clean(
             add_layouts(table["skeletons"])
     if rig is not None:
         table["rig"] = read_toml(rig)
-    check_format(out)
-    check_output(source, out)
+    output.check_format(out)
+    output.check_output(source, out)
     if events is not None:
-        check_file(source, events, (".csv",), replace=force)
+        output.check_file(source, events, (".csv",), replace=force)
         if events.resolve() == out.resolve():
             raise LaunchError(f"--events {events}: expected another path than OUT's")
-    terminal = console()
+    terminal = output.console()
     compile_missing(lambda line: terminal.print(printable(line)))
     if is_folder_of_recordings(source):
         if events is not None:
@@ -102,17 +90,17 @@ def clean(
         raise LaunchError(f"--{'ray' if ray else 'jobs'}: expected a folder of recordings as IN, got {source}, one")
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
-        done = clean_recording(
+        done = output.clean_recording(
             source, out, table, events=events, replace=force,
             began=lambda frames: progress.update(bar, total=frames), advanced=lambda: progress.advance(bar),
         )  # fmt: skip
     spent = f"{done.duration_s:.1f} s, cleaned in {done.spent_s:.1f} s"
-    terminal.print(f"{out}: {plural(done.frames, 'frame')}, {spent}")
-    print_faults(terminal, done.refused, done.problems)
+    terminal.print(f"{out}: {output.plural(done.frames, 'frame')}, {spent}")
+    output.print_faults(terminal, done.refused, done.problems)
     if not done.poses:
-        terminal.print(f"  {NO_POSE}; `steadypose info {source}` shows what it contains", style="red")
+        terminal.print(f"  {output.NO_POSE}; `steadypose info {source}` shows what it contains", style="red")
     elif not done.trusted:
-        terminal.print(f"  {UNTRUSTED}", style="red")
+        terminal.print(f"  {output.UNTRUSTED}", style="red")
     if done.unread:
         terminal.print(f"  {source} is damaged: the readable part is cleaned", style="red")
     return 1 if done.unread or not done.trusted else 0

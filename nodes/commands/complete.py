@@ -5,16 +5,8 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from steadypose.nodes.commands.output import (
-    File,
-    In,
-    Out,
-    check_poses_file,
-    console,
-    plural,
-    print_faults,
-    write_output,
-)
+from steadypose.nodes.commands import output
+from steadypose.nodes.commands.output import File, In, Out
 from steadypose.nodes.graph.launch import read_toml
 from steadypose.nodes.graph.threads import one_thread
 from steadypose.nodes.offline import alternative_of, complete_source, load_completer
@@ -74,9 +66,9 @@ def complete(
     if skeletons is not None:
         add_layouts(read_toml(skeletons).get("skeletons", {}))
     alternatives = {seed: out.with_name(f"{out.stem}.{seed}{out.suffix}") for seed in range(1, samples + 1)}
-    check_poses_file(source, out, *([picture] if picture else []), replace=force)
+    output.check_poses_file(source, out, *([picture] if picture else []), replace=force)
     for other in alternatives.values():
-        check_poses_file(source, other, replace=force)
+        output.check_poses_file(source, other, replace=force)
     if samples < 0:
         raise LaunchError(f"--samples: expected 0 or more, got {samples}")
     if picture is not None and picture.suffix not in IMAGES:
@@ -87,7 +79,7 @@ def complete(
         from steadypose.prior.fit.optimise import Optimiser
 
         fill = Optimiser.load("default", fill)
-    terminal = console()
+    terminal = output.console()
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=None)
         completed = complete_source(
@@ -96,25 +88,25 @@ def complete(
             uncertainty,
             lambda frames, total: progress.update(bar, completed=frames, total=total),
         )
-        write_output(out, completed.arrays, completed.messages)
+        output.write_output(out, completed.arrays, completed.messages)
         for seed, other in alternatives.items():
             drawn = alternative_of(completed, uncertainty, seed)
-            write_output(other, drawn.arrays, drawn.messages)
+            output.write_output(other, drawn.arrays, drawn.messages)
     completion = completed.completion
     people = len({stretch.body for stretch, _ in completion.done})
     longest = max(done.span for _, done in completion.done) / FPS
     terminal.print(
-        f"{out}: {plural(len(completion.clean) - 1, 'frame')} of {plural(people, 'body', 'bodies')}; "
+        f"{out}: {output.plural(len(completion.clean) - 1, 'frame')} of {output.plural(people, 'body', 'bodies')}; "
         f"{completion.given:.0%} of their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
     if completion.unreached:
-        unreached = plural(completion.unreached, "joint")
+        unreached = output.plural(completion.unreached, "joint")
         terminal.print(f"  left unknown, too far from any observation: {unreached}", style="yellow")
     for body in completion.centred:
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for other in alternatives.values():
         terminal.print(f"  wrote an alternative: {other}")
-    print_faults(terminal, completed.refused, completed.problems)
+    output.print_faults(terminal, completed.refused, completed.problems)
     if picture is not None:
         save(draw_completion(completion, source.name), picture)
         terminal.print(f"wrote {picture}")

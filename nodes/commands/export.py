@@ -10,18 +10,8 @@ from rich.progress import Progress
 from steadypose import PACKAGE
 from steadypose.msgs.topics import POSE_WORLD
 from steadypose.msgs.types import PoseWorld
-from steadypose.nodes.commands.output import (
-    ARRAY_FILES,
-    UNTRUSTED,
-    File,
-    In,
-    Out,
-    check_file,
-    console,
-    plural,
-    print_faults,
-    unfinished,
-)
+from steadypose.nodes.commands import output
+from steadypose.nodes.commands.output import File, In, Out
 from steadypose.nodes.driving import OfflineRun
 from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import STREAMS, LaunchError, located
@@ -64,7 +54,7 @@ def export(
         force: replace OUT if it exists.
     """
     source = located(str(source), Path(), STREAMS)
-    check_file(source, out, FORMATS, replace=force)
+    output.check_file(source, out, FORMATS, replace=force)
     if names != "smpl22" and out.suffix not in NAMED:
         raise LaunchError(f"--names {names}: expected OUT to end in {' or '.join(NAMED)}, got {out.suffix}")
     if not source.exists():
@@ -87,9 +77,9 @@ def export(
         content = to_bvh(motion, AVATAR_NAMES[names])
     else:
         content = {".csv": to_csv, ".trc": to_trc}[out.suffix](motion)
-    with unfinished(out) as part:
+    with output.unfinished(out) as part:
         part.write_bytes(content)
-    console().print(f"{out}: {plural(len(motion.root), 'frame')} at {motion.fps:g} Hz")
+    output.console().print(f"{out}: {output.plural(len(motion.root), 'frame')} at {motion.fps:g} Hz")
     return 0
 
 
@@ -123,7 +113,7 @@ def retarget(
         body: id of the person to follow. Default: the first one visible.
         force: replace OUT if it exists.
     """
-    check_file(source, out, ARRAY_FILES, replace=force)
+    output.check_file(source, out, output.ARRAY_FILES, replace=force)
     if urdf is None:
         example = PACKAGE / "launch" / "robots" / "humanoid29.urdf"
         raise LaunchError(f"expected --urdf FILE, the robot's; {example} is one to try with")
@@ -142,7 +132,7 @@ def retarget(
     robot = load_robot(urdf, given)
     follower = Follower(Retargeter(robot, sole), body)
     poses = []
-    terminal = console()
+    terminal = output.console()
     with Progress(console=terminal, disable=not terminal.is_terminal) as progress:
         bar = progress.add_task(source.name, total=len(recording))
         for topic, message in run:
@@ -151,19 +141,19 @@ def retarget(
             world = message if topic == POSE_WORLD and isinstance(message, PoseWorld) else None
             if world and (pose := follower.process(world)) is not None:
                 poses.append(pose)
-    print_faults(terminal, {}, run.diagnosis.texts)
+    output.print_faults(terminal, {}, run.diagnosis.texts)
     if not poses:
-        whom, frames = "nobody" if body is None else f"no body {body}", plural(run.diagnosis.frames, "frame")
+        whom, frames = "nobody" if body is None else f"no body {body}", output.plural(run.diagnosis.frames, "frame")
         raise LaunchError(f"{source}: {whom} to follow in {frames}; `steadypose info {source}` says who is there")
     stamp_ns, root, joints, stands = (np.array(column) for column in zip(*poses, strict=True))
-    with unfinished(out) as part:
+    with output.unfinished(out) as part:
         if out.suffix == ".npz":
             names = np.array(robot.joints)
             np.savez(part, stamp_ns=stamp_ns, root=root, joints=joints, stands=stands, joint_names=names)
         else:
             table = np.column_stack([(stamp_ns - stamp_ns[0]) / 1e9, root, joints])
             np.savetxt(part, table, "%.6f", ",", header=",".join(["time", *ROOT, *robot.joints]), comments="")
-    print(f"{out}: {plural(len(poses), 'frame')} of {len(robot.joints)} joints")
+    print(f"{out}: {output.plural(len(poses), 'frame')} of {len(robot.joints)} joints")
     if not run.diagnosis.trusted:
-        terminal.print(f"  {UNTRUSTED}", style="red")
+        terminal.print(f"  {output.UNTRUSTED}", style="red")
     return 0 if run.diagnosis.trusted else 1

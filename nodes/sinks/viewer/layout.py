@@ -9,16 +9,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.topics import POSE_CLEAN, POSE_RAW, POSE_WORLD
 from steadypose.msgs.types import JointState
-from steadypose.nodes.sinks.drawing import (
-    ALARM_COLOUR,
-    CONTACT_COLOUR,
-    DARK,
-    FAINT,
-    ON_DARK,
-    RAW_COLOUR,
-    STATE_COLOURS,
-    TRUTH_COLOUR,
-)
+from steadypose.nodes.sinks import drawing
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -31,14 +22,16 @@ def _rgb(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
-DARK_RGB = _rgb(DARK)
-SIDE_RGB = np.array([_rgb(colour) for colour in ON_DARK], np.uint8)  # (3, 3) colours of left, right and middle
-FAINT_RGB = (FAINT * SIDE_RGB + (1.0 - FAINT) * np.array(DARK_RGB)).astype(np.uint8)
+DARK_RGB = _rgb(drawing.DARK)
+SIDE_RGB = np.array([_rgb(colour) for colour in drawing.ON_DARK], np.uint8)  # (3, 3) colours of left, right and middle
+FAINT_RGB = (drawing.FAINT * SIDE_RGB + (1.0 - drawing.FAINT) * np.array(DARK_RGB)).astype(np.uint8)
 """(3, 3) colours of unobserved joints and bones, blended with the background because Rerun's lines have no opacity."""
-STATE_RGB = np.array([_rgb(STATE_COLOURS[state]) for state in JointState], np.uint8)
-RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(_rgb, (RAW_COLOUR, TRUTH_COLOUR, CONTACT_COLOUR, ALARM_COLOUR))
+STATE_RGB = np.array([_rgb(drawing.STATE_COLOURS[state]) for state in JointState], np.uint8)
+RAW_RGB, TRUTH_RGB, CONTACT_RGB, ALARM_RGB = map(
+    _rgb, (drawing.RAW_COLOUR, drawing.TRUTH_COLOUR, drawing.CONTACT_COLOUR, drawing.ALARM_COLOUR)
+)
 PATH_RGB = [235, 235, 235]
-RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(STATE_COLOURS[JointState.REFINED]), POSE_WORLD: CONTACT_RGB}
+RATE_RGB = {POSE_RAW: RAW_RGB, POSE_CLEAN: _rgb(drawing.STATE_COLOURS[JointState.REFINED]), POSE_WORLD: CONTACT_RGB}
 LEGEND = """
 - **blue** left, **orange** right
 - **faint** not observed: inferred; the sphere is its standard deviation

@@ -26,18 +26,7 @@ from steadypose.msgs.types import (
     WorldBody,
 )
 from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_INDICES, SIDES, bone_states, bones, facing, to_world
-from steadypose.nodes.sinks.viewer.layout import (
-    CONTACT_RGB,
-    FAINT_RGB,
-    PATH_RGB,
-    RATE_RGB,
-    SIDE_RGB,
-    TIMELINE,
-    TRUTH_RGB,
-    Eye,
-    blueprint,
-    name_series,
-)
+from steadypose.nodes.sinks.viewer import layout
 from steadypose.prior.body.layouts import SKELETONS, to_canonical
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J
 
@@ -70,7 +59,7 @@ class PoseView:
         self._recording = recording
         self._origin_ns: int | None = None
         self._last: dict[str, tuple[int, int]] = {}
-        self._eye: Eye | None = None
+        self._eye: layout.Eye | None = None
         self._calibrated = True
         self._scored = False
         self._images: deque[CameraImage] = deque(maxlen=MOST_IMAGES)
@@ -78,7 +67,7 @@ class PoseView:
         self._focus: dict[str, NDArray[np.float64]] = {}
         self._drawn: dict[str, set[str]] = {}
         self._paths: dict[str, deque[tuple[int, NDArray[np.float64]]]] = {}
-        name_series(recording)
+        layout.name_series(recording)
         self._send_layout()
 
     def log(self, topic: str, message: Message) -> None:
@@ -124,7 +113,7 @@ class PoseView:
 
     def _draw_rates(self, message: Diagnostics) -> None:
         """Draw the rates that nodes report, at the time of the newest pose. The viewer's own counts may skip frames."""
-        for topic in RATE_RGB:
+        for topic in layout.RATE_RGB:
             if (rate := message.values.get(f"rate.{topic}")) is not None and self._origin_ns is not None:
                 self._scalar(f"plots/rates/{topic}", float(rate))
 
@@ -145,7 +134,7 @@ class PoseView:
             shade = 70 + 185 * np.clip(np.nan_to_num(body.confidence[observed]), 0, 1)  # higher confidence is whiter
             grey = np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)
             self._log(f"{path}/joints", rr.Points3D(positions[observed], radii=0.016, colors=grey))
-            self._bones(f"{path}/bones", canonical, pairs, SIDE_RGB[SIDES[pairs[:, 1]]])
+            self._bones(f"{path}/bones", canonical, pairs, layout.SIDE_RGB[SIDES[pairs[:, 1]]])
             yield path, canonical
 
     def _draw_clean(self, message: PoseClean) -> Iterator[tuple[str, NDArray[np.float64]]]:
@@ -182,20 +171,22 @@ class PoseView:
             positions = body.positions.astype(np.float64)
             if truth:
                 path = _entity("world/truth", message.source, body)
-                self._bones(f"{path}/bones", positions, ALL_BONES, TRUTH_RGB, radius=0.006)
+                self._bones(f"{path}/bones", positions, ALL_BONES, layout.TRUTH_RGB, radius=0.006)
                 yield path, positions
                 continue
             path = _entity("world", message.source, body)
             self._body(path, positions, body.state, body.sigma)
             trail = self._floor_path(path, message, body)
-            self._log(f"{path}/path", rr.LineStrips3D([trail], colors=PATH_RGB, radii=0.01))
+            self._log(f"{path}/path", rr.LineStrips3D([trail], colors=layout.PATH_RGB, radii=0.01))
             touching = positions[CONTACT_INDICES[body.contacts > CONTACT_PROBABILITY]]
-            self._log(f"{path}/contacts", rr.Points3D(touching, colors=CONTACT_RGB, radii=0.035))
+            self._log(f"{path}/contacts", rr.Points3D(touching, colors=layout.CONTACT_RGB, radii=0.035))
             root, velocity = [body.root_position], [body.root_velocity]
-            self._log(f"{path}/velocity", rr.Arrows3D(origins=root, vectors=velocity, colors=PATH_RGB, radii=0.012))
+            self._log(
+                f"{path}/velocity", rr.Arrows3D(origins=root, vectors=velocity, colors=layout.PATH_RGB, radii=0.012)
+            )
             standing = "" if body.tracking == Tracking.OK else f" · {body.tracking.name.lower()}"
             above = positions[[J["head"]]] + [0, 0, 0.28]
-            label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=PATH_RGB, radii=0.0)
+            label = rr.Points3D(above, labels=f"{body.id}{standing}", colors=layout.PATH_RGB, radii=0.0)
             self._log(f"{path}/label", label)
             yield path, positions
 
@@ -205,9 +196,11 @@ class PoseView:
 
         observed = np.isin(bone_states(state), OBSERVED)[:, None]
         sides = SIDES[ALL_BONES[:, 1]]
-        self._bones(f"{path}/bones", positions, ALL_BONES, np.where(observed, SIDE_RGB[sides], FAINT_RGB[sides]))
+        self._bones(
+            f"{path}/bones", positions, ALL_BONES, np.where(observed, layout.SIDE_RGB[sides], layout.FAINT_RGB[sides])
+        )
         shown = (state != JointState.UNKNOWN) & np.isfinite(positions).all(axis=1)
-        colours = np.where(np.isin(state, OBSERVED)[:, None], SIDE_RGB[SIDES], FAINT_RGB[SIDES])
+        colours = np.where(np.isin(state, OBSERVED)[:, None], layout.SIDE_RGB[SIDES], layout.FAINT_RGB[SIDES])
         self._log(f"{path}/joints", rr.Points3D(positions[shown], radii=0.018, colors=colours[shown]))
         imputed = shown & (state == JointState.IMPUTED)
         spheres = rr.Ellipsoids3D(
@@ -242,7 +235,7 @@ class PoseView:
 
     def _send_layout(self) -> None:
         self._recording.send_blueprint(
-            blueprint(self._eye, calibrated=self._calibrated, scored=self._scored, images=self._has_images)
+            layout.blueprint(self._eye, calibrated=self._calibrated, scored=self._scored, images=self._has_images)
         )
 
     def _set_time(self, topic: str, stamp_ns: int) -> None:
@@ -253,7 +246,7 @@ class PoseView:
         if stamp_ns < last_ns - BACK_JUMP_NS:
             origin_ns -= last_ns - stamp_ns
         self._last[topic] = stamp_ns, origin_ns
-        self._recording.set_time(TIMELINE, duration=np.timedelta64(stamp_ns - origin_ns, "ns"))
+        self._recording.set_time(layout.TIMELINE, duration=np.timedelta64(stamp_ns - origin_ns, "ns"))
 
     def _scalar(self, path: str, value: float | NDArray[np.integer]) -> None:
         import rerun as rr
@@ -274,7 +267,7 @@ class PoseView:
         self._log(f"{topic.removeprefix('pose/')}/focus", rr.Points3D([self._focus[topic]], radii=0.0))
         if self._eye is None:
             front = facing(bodies[0])
-            self._eye = Eye(target, np.array([1.0, 0.0, 0.0]) if front is None else front)
+            self._eye = layout.Eye(target, np.array([1.0, 0.0, 0.0]) if front is None else front)
             self._calibrated = calibrated
             self._send_layout()
 
