@@ -1,4 +1,5 @@
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -28,22 +29,6 @@ def run(positions: np.ndarray, **settings) -> tuple[np.ndarray, Counter[str]]:
     return np.array(passed), counters
 
 
-def test_ordinary_motion_with_ordinary_noise_passes_untouched() -> None:
-    positions = noisy(90, 0.01)
-    passed, counters = run(positions)
-    assert np.array_equal(passed, positions)
-    assert not counters
-
-
-def test_a_spike_becomes_unobserved_and_the_next_frame_passes() -> None:
-    positions = noisy(90, 0.01)
-    positions[50, WRIST] += [0.3, 0, 0]
-    passed, counters = run(positions)
-    assert np.isnan(passed[50, WRIST]).all()
-    assert np.array_equal(passed[51], positions[51])
-    assert counters["joints_refused"] == 1
-
-
 def struck(frames: int = 90) -> np.ndarray:
     """Somebody whose forearm turns over by two radians in one frame and back, about an elbow that rests."""
     positions = np.repeat(waving(1), frames, axis=0)
@@ -52,16 +37,44 @@ def struck(frames: int = 90) -> np.ndarray:
     return positions
 
 
-def test_of_a_perfect_sensor_a_joint_that_kept_its_bones_is_believed_however_fast() -> None:
-    positions = struck()
-    assert np.linalg.norm(positions[50, WRIST] - positions[49, WRIST]) > 0.2
-    passed, counters = run(positions)
+def crossed() -> np.ndarray:
+    """Somebody whose legs are crossed from the first frame on."""
+    order = np.arange(22)
+    lower = np.concatenate(limbs(("knee", "ankle", "foot")))
+    order[lower] = MIRROR[lower]
+    return noisy(30, 0.01)[:, order]
+
+
+@pytest.mark.parametrize(
+    ("positions", "enabled"),
+    [
+        (noisy(90, 0.01), True),
+        (crossed(), True),
+        (struck(), True),
+        (noisy(90, 0.01) + np.repeat([0.0, 1.0], 45)[:, None, None], False),
+    ],
+    ids=["ordinary", "crossed legs", "a perfect sensor's joint that kept its bones", "switched off"],
+)
+def test_what_may_be_passes_untouched_and_everything_where_it_is_switched_off(positions: np.ndarray, enabled: bool):
+    passed, counters = run(positions, enabled=enabled)
     assert np.array_equal(passed, positions)
     assert not counters
 
 
+@pytest.mark.parametrize(("joints", "by", "frames"), [([WRIST], 0.3, 1), (range(22), 1.0, 1), (range(22), 1.0, 3)])
+def test_what_jumps_for_a_few_frames_is_refused_in_these_alone(joints: Sequence[int], by: float, frames: int) -> None:
+    positions = noisy(90, 0.01)
+    jumps = np.zeros((90, 22), dtype=bool)
+    jumps[50 : 50 + frames, joints] = True
+    positions[jumps] += [by, 0, 0]
+    passed, counters = run(positions)
+    assert np.array_equal(passed, np.where(jumps[..., None], np.nan, positions), equal_nan=True)
+    assert counters == {"joints_refused": jumps.sum()}
+
+
 def test_of_a_sensor_whose_bones_vary_their_lengths_excuse_nothing() -> None:
     positions = struck()
+    assert np.linalg.norm(positions[50, WRIST] - positions[49, WRIST]) > 0.2
     noise = np.random.default_rng(0).normal(size=positions.shape) * 0.02
     noise[50, ARM] = 0.0
     passed, _ = run(positions + noise)
@@ -124,15 +137,6 @@ def test_exchanged_sides_are_put_back_from_the_first_frame_on_and_for_seconds(
     assert np.array_equal(passed, positions, equal_nan=True)
 
 
-def test_crossed_legs_are_not_exchanged_in_the_first_frames() -> None:
-    order = np.arange(22)
-    lower = np.concatenate(limbs(("knee", "ankle", "foot")))
-    order[lower] = MIRROR[lower]
-    crossed = noisy(30, 0.01)[:, order]
-    passed, _ = run(crossed)
-    assert np.array_equal(passed, crossed)
-
-
 def test_sides_are_put_back_while_a_joint_is_hidden() -> None:
     positions = noisy(90, 0.01)
     positions[40:60, WRIST] = np.nan
@@ -183,28 +187,6 @@ def test_in_noise_that_hides_the_posture_no_first_frame_is_exchanged() -> None:
     assert not ExchangedLimbs(0.3, 300).begin(seen).any()
 
 
-def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
-    positions = noisy(90, 0.01)
-    arms = [J[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist") for side in ("left", "right")]
-    spoilt = positions.copy()
-    spoilt[50:53, arms] = positions[50:53][:, MIRROR[arms]]
-    passed, counters = run(spoilt)
-    assert np.array_equal(passed, positions)
-    assert counters == {"limbs_exchanged": 3}
-
-
-@pytest.mark.parametrize("bad", [1, 3])
-def test_a_body_that_jumps_for_a_few_frames_is_refused_in_these(bad: int) -> None:
-    positions = noisy(90, 0.01)
-    positions[50 : 50 + bad] += [1.0, 0, 0]
-    passed, counters = run(positions)
-    assert np.isnan(passed[50 : 50 + bad]).all()
-    assert np.array_equal(
-        np.delete(passed, np.s_[50 : 50 + bad], axis=0), np.delete(positions, np.s_[50 : 50 + bad], axis=0)
-    )
-    assert counters == {"joints_refused": 22 * bad}
-
-
 def test_a_body_that_jumped_for_good_is_believed_soon_and_after_a_gap_at_once() -> None:
     positions = noisy(90, 0.01)
     positions[50:] += [1.0, 0, 0]
@@ -212,6 +194,16 @@ def test_a_body_that_jumped_for_good_is_believed_soon_and_after_a_gap_at_once() 
     assert np.flatnonzero(refused).tolist() == [50, 51, 52, 53, 54, 55]
     positions[45:50] = np.nan
     assert np.array_equal(run(positions)[0], positions, equal_nan=True)
+
+
+def test_shoulders_that_are_exchanged_with_the_arms_are_put_back_too() -> None:
+    positions = noisy(90, 0.01)
+    arms = limbs_of("shoulder", "elbow", "wrist")
+    spoilt = positions.copy()
+    spoilt[50:53, arms] = positions[50:53][:, MIRROR[arms]]
+    passed, counters = run(spoilt)
+    assert np.array_equal(passed, positions)
+    assert counters == {"limbs_exchanged": 3}
 
 
 def test_frames_interpolated_from_a_bad_one_are_refused_too() -> None:
@@ -237,14 +229,6 @@ def test_low_confidence_is_not_seen() -> None:
     passed = gate.update(observation(waving(1), confidence=confidence)).positions[0]
     assert np.isnan(passed[KNEE]).all()
     assert np.isfinite(passed[WRIST]).all()
-
-
-def test_switched_off_everything_passes() -> None:
-    positions = noisy(90, 0.01)
-    positions[50, WRIST] += [0.5, 0, 0]
-    passed, counters = run(positions, enabled=False)
-    assert np.array_equal(passed, positions)
-    assert not counters
 
 
 def test_a_joint_that_is_frozen_becomes_unobserved() -> None:
