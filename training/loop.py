@@ -3,8 +3,6 @@
 Training is resumable, shows a progress bar, draws curves as it runs, and writes a card beside the weights.
 """
 
-from __future__ import annotations
-
 import copy
 import io
 import json
@@ -90,7 +88,7 @@ class Recipe(Generic[Network]):
     average: float | None = None
     """decay of the exponential moving average of the parameters; if given, the average is evaluated and saved"""
 
-    def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> TrainingRun:
+    def minimise(self, network: Network, directory: Path, iterations: int, seed: int) -> "TrainingRun":
         """Train ``network`` in place, in the folder of a run; resumes a checkpoint there."""
         mean = network if self.average is None else copy.deepcopy(network)
         kept = network if mean is network else nn.ModuleDict({"network": network, "mean": mean})

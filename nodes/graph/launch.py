@@ -6,8 +6,6 @@ declares the sections of nodes. On the command line, ``--set delay=2`` means ``p
 name ends in ``delay``.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -76,7 +74,7 @@ class Launch(_EveryLaunch):
             raise LaunchError("[server] clients do not wait: expected [transport] lossless = false")
 
     @classmethod
-    def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> Launch:
+    def read(cls, path: str | Path, overrides: Iterable[str] = ()) -> "Launch":
         """Read a launch file: a path, or the name of a bundled one (``replay``, ``oak``).
 
         ``overrides``, each ``section.key=value``, replace the file's values. A value is TOML, or plain text if it is

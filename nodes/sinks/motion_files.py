@@ -4,8 +4,6 @@ BVH is in centimetres, y up, with a T pose that faces +z as rest pose; a person 
 `nodes.sources.recording` reads it. TRC is as OpenSim reads it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +39,7 @@ class BodyMotion:
     offsets: Floats  # (22, 3) metres, each joint in its parent's frame
     start_s: float = 0.0  # stamp of the first frame, seconds
 
-    def ahead(self) -> BodyMotion:
+    def ahead(self) -> "BodyMotion":
         """The motion with its world turned for animation programs (`drawing.ahead`)."""
         root, rotations = self.root, self.rotations.copy()
         root, rotations[:, 0] = ahead(root, rotations[:, 0])

@@ -9,8 +9,6 @@ frame. The sink sends the newest pose as a JSON datagram for each message of ``p
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 # an optional extra that may not be installed; MuJoCo's module has no stubs
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -63,7 +61,7 @@ def check_retarget(launch: Launch) -> None:
     load_robot(Path(settings.urdf), settings.links)
 
 
-def datagram(pose: RobotPose, joints: tuple[str, ...]) -> bytes:
+def datagram(pose: "RobotPose", joints: tuple[str, ...]) -> bytes:
     """A pose as JSON: capture time in seconds, root link in the world (metres, xyzw), joints by name."""
     return json.dumps(
         {

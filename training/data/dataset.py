@@ -1,7 +1,5 @@
 """Windows of prepared motion for training: sampled, mirrored, resampled, heading-normalised."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -41,7 +39,7 @@ class MotionSet:
     """(C,) data set; empty likewise"""
 
     @classmethod
-    def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> MotionSet:
+    def load(cls, path: Path, weights: str, split: str, *, flat: bool = False) -> "MotionSet":
         """Read ``steadypose prepare``'s output.
 
         Args:
@@ -92,7 +90,7 @@ class MotionSet:
         """Duration of the motion, hours."""
         return len(self.rotations) / FPS / 3600
 
-    def only(self, clips: NDArray[np.bool_]) -> MotionSet:
+    def only(self, clips: NDArray[np.bool_]) -> "MotionSet":
         """Select these clips (C,). Raises ValueError if none is selected."""
         if not clips.any():
             raise ValueError(f"expected at least one of {len(clips)} clips, none is wanted")

@@ -1,8 +1,6 @@
 """Training and validation data of the mixture as plain arrays: motion at several speeds, and a real Kinect with
 Vicon."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +49,7 @@ class Pairs:
     start: NDArray[np.int64]  # (C + 1,) first frame of each recording, and the end
     subject: NDArray[np.str_]  # (C,) the person
 
-    def of(self, subjects: Collection[str]) -> Pairs:
+    def of(self, subjects: Collection[str]) -> "Pairs":
         clips = np.flatnonzero(np.isin(self.subject, list(subjects)))
         rows = np.concatenate([np.arange(*self.start[c : c + 2]) for c in clips])
         lengths = np.diff(self.start)[clips]

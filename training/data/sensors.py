@@ -1,7 +1,5 @@
 """Simulated sensors for training the mixture, with errors from 0 to 8 cm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +62,7 @@ class Sensors:
         self._pair_weight = np.maximum(lengths - 20, 0) / np.maximum(lengths - 20, 0).sum()
 
     @classmethod
-    def of(cls, arrays: Path, split: str, frames: int) -> Sensors:
+    def of(cls, arrays: Path, split: str, frames: int) -> "Sensors":
         """Of the motion and pairs of a split in the folder of `recordings.write_arrays`."""
         return cls(load_motion(arrays, split), load_kinect(arrays, split), frames)
 

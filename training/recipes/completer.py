@@ -9,8 +9,6 @@ In training, windows of true motion lose the entries that `complete` is asked fo
 between key frames, parts of the body, and combinations of these. In some windows, the known joints are slightly noisy.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -152,7 +150,7 @@ class Truth:
     offsets: Tensor  # (B, 22, 3) metres, bones
 
     @classmethod
-    def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> Truth:
+    def of(cls, motion: MotionSet, rows: NDArray[np.int64], rng: Rng | None = None) -> "Truth":
         """Select frames (B, T); with ``rng``, mirror half of the windows and scale all at random."""
         rotations, root, offsets = motion.rotations[rows], motion.positions[rows, 0], motion.offsets[rows[:, 0]]
         if rng is not None:
