@@ -23,15 +23,7 @@ from steadypose.benchmarks.results import load
 _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints that are observed in it are now nearer"
 _PATH = "measured before HG-VAE's path followed fast motion of the whole body, on which joints here hardly depend"
 _MEASURED_BEFORE_PATH = (
-    "contacts",
-    "counter",
-    "event_mocap",
-    "events",
-    "heading",
     "hgvae",
-    "hidden_joints",
-    "layouts",
-    "mediapipe",
     "noisy_joints",
     "world",
 )
