@@ -99,9 +99,6 @@ def complete(
         f"{out}: {output.plural(len(completion.clean) - 1, 'frame')} of {output.plural(people, 'body', 'bodies')}; "
         f"{completion.given:.0%} of their joints were given, the rest completed; the longest gap was {longest:.1f} s"
     )
-    if completion.unreached:
-        unreached = output.plural(completion.unreached, "joint")
-        terminal.print(f"  left unknown, too far from any observation: {unreached}", style="yellow")
     for body in completion.centred:
         terminal.print(f"  body {body}: the pelvis is always at the origin, so the path is predicted from the motion")
     for other in alternatives.values():

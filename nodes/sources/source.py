@@ -101,6 +101,9 @@ class WebcamSettings:
     """largest number of bodies to detect; more than one only with ``model``"""
     field_of_view: float = 1.05
     """horizontal field of view of an uncalibrated lens, radians; it scales the distance of bodies"""
+    name: str = ""
+    """source name in messages; empty for webcam- and its number. Cameras that are merged or share a server need
+    different names"""
 
     def __post_init__(self) -> None:
         check_range("[input.webcam] camera", self.camera, 0, 1000)

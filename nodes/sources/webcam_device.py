@@ -214,7 +214,7 @@ def connect(
             raise CameraError(f"camera {settings.camera} cannot be opened; `ls /dev/video*` lists them")
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # read the newest image, not the oldest in the buffer
         with make_landmarker(settings) as landmarker:
-            name = f"webcam-{settings.camera}"
+            name = settings.name or f"webcam-{settings.camera}"
             with closing(PoseFinder(name, landmarker, settings, calibration, image_file)) as finder:
                 yield Webcam(capture, finder, name, clock)
     finally:

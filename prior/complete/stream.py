@@ -72,11 +72,6 @@ class Completion:
         known = [completed.known.mean() for _, completed in self.done]
         return float(np.average(known, weights=[len(stretch.given) for stretch, _ in self.done]))
 
-    @property
-    def unreached(self) -> int:
-        """Number of joints too far in time from all known joints."""
-        return sum(int((~finite_joints(completed.positions)).sum()) for _, completed in self.done)
-
 
 def complete_raws(
     source: str,

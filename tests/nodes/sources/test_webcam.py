@@ -80,9 +80,10 @@ def open_webcam(settings: WebcamSettings, clock: Clock, seen: Seen) -> CameraSou
     return CameraSource(clock, lambda: connect(settings, NOT_CALIBRATED, clock))
 
 
-def test_each_image_gives_the_bodies_in_it(video: Path, model: str) -> None:
+@pytest.mark.parametrize(("name", "published"), [("", "webcam-3"), ("door", "door")])
+def test_each_image_gives_the_bodies_in_it(name: str, published: str, video: Path, model: str) -> None:
     seen = Seen()
-    source = open_webcam(WebcamSettings(camera=3, model=model), Clock(), seen)
+    source = open_webcam(WebcamSettings(camera=3, model=model, name=name), Clock(), seen)
     frames: list[PoseRaw] = []
     for frame in source.frames():
         if frame is None:
@@ -94,7 +95,7 @@ def test_each_image_gives_the_bodies_in_it(video: Path, model: str) -> None:
     stamps = [frame.stamp_ns for frame in frames]
     assert stamps == sorted(stamps)
     for frame in frames:
-        assert (frame.skeleton, frame.source, len(frame.bodies)) == ("blazepose33", "webcam-3", 1)
+        assert (frame.skeleton, frame.source, len(frame.bodies)) == ("blazepose33", published, 1)
         np.testing.assert_allclose(frame.bodies[0].positions.mean(axis=0), [0.1, 0.2, 2.5], atol=0.2)
     colours, milliseconds = zip(*seen.images, strict=True)
     assert [int(colour[2]) > int(colour[0]) for colour in colours[2:]] == [True] * 3, "RGB, not OpenCV's BGR"
