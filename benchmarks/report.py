@@ -21,10 +21,7 @@ from steadypose.benchmarks.provenance import RESULTS, ROOT
 from steadypose.benchmarks.results import load
 
 _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints that are observed in it are now nearer"
-_PATH = "measured before HG-VAE's path followed fast motion of the whole body, on which joints here hardly depend"
-_MEASURED_BEFORE_PATH = ("noisy_joints",)
 STALE: dict[str, str] = {
-    **dict.fromkeys(_MEASURED_BEFORE_PATH, _PATH),
     **dict.fromkeys(("humor", "latency", "restart", "retarget", "scale"), _CORRELATED),
     "soak": "measured before the steady stage and the fast matrix products, on which its losses depend little",
 }  # fmt: skip
