@@ -22,7 +22,7 @@ from steadypose.benchmarks.results import load
 
 _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints that are observed in it are now nearer"
 STALE: dict[str, str] = {
-    **dict.fromkeys(("humor", "latency", "restart", "retarget", "scale"), _CORRELATED),
+    **dict.fromkeys(("latency", "restart", "retarget", "scale"), _CORRELATED),
     "soak": "measured before the steady stage and the fast matrix products, on which its losses depend little",
 }  # fmt: skip
 """Results that are kept although what they measured has changed since, each with the reason. A test compares this list
