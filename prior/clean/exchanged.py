@@ -35,8 +35,9 @@ POSSIBLE = 60.0
 cm along a camera's ray, half have more than 90, and misfits do not distinguish labellings."""
 
 CROSSED = 45.0
-"""The same in a body's first frames, where no jump shows, if legs are exchanged without their hips: a dancer's crossed
-legs look so, with a misfit of 55. Of exchanged legs, 2 to 4 % less are found (validation)."""
+"""The same in a body's first frames, where no jump shows, if legs are exchanged without their hips: crossed legs
+look so. Validation people need no bound below `POSSIBLE`, and 2 to 4 % less of their exchanged legs are found; it is
+there for one test person, a dancer, whose crossed legs have a misfit of 55."""
 
 MEMORY = 9  # length of the running mean of misfits, frames
 

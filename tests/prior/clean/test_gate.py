@@ -38,7 +38,7 @@ def struck(frames: int = 90) -> np.ndarray:
 
 
 def crossed() -> np.ndarray:
-    """Legs wide apart, the head far back, and then left and right legs exchanged: a misfit of 54 when put back."""
+    """Legs wide apart, the head far back, and then left and right legs exchanged: a misfit of 54 when swapped back."""
     positions = noisy(30, 0.01)
     positions[:, J["head"], 0] -= 0.2
     left, right = limbs(("knee", "ankle", "foot"))
