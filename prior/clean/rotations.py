@@ -27,6 +27,9 @@ from steadypose.prior.clean.settings import OrientSettings, RefineSettings
 from steadypose.prior.models.hmvae import LiveHMVAE
 from steadypose.prior.models.posture import LivePosture, average_root
 
+LIMIT = 1.5
+"""Limit of the moves of joints, in their standard deviations: few training people raise an arm as high as some do."""
+
 
 class Refine:
     """Local rotations of the last frames: solved from the observed joints and, if enabled, refined by HM-VAE.
@@ -94,7 +97,7 @@ class Orient:
         if not len(slots):
             return estimate
         positions, sigma, offsets = estimate.positions[slots], estimate.sigma[slots], estimate.offsets[slots]
-        expected = self._posture(positions, sigma, np.linalg.norm(offsets, axis=-1))
+        expected = self._posture(positions, sigma, np.linalg.norm(offsets, axis=-1), limit=LIMIT)
         root = average_root(expected, positions, sigma, offsets)
         turned = global_rotations(solve_rotations(expected.positions, offsets, estimate.rotations[slots], root))
         twist, turns = self._twist[slots], self._turns[slots]

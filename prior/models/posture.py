@@ -9,6 +9,9 @@ does not move, and a hidden joint follows the others. The result is then conditi
 The frame is spanned by the noisy hips and shoulders. S therefore includes a rotation and a translation of the frame.
 The Gaussian does not depend on the body's orientation in the world, so a body may lie, or stand on its hands.
 
+Under a Gaussian, postures unlike those of training people are too unlikely. `LivePosture` therefore takes a factor on
+its covariance, and a limit on how far a joint moves, relative to what the Gaussian predicts of such moves.
+
 The rotation of the pelvis in that frame is another vector of the Gaussian, so it is also estimated from shoulders,
 spine and thighs. The root's rotation is a weighted average of this estimate and the estimate from the pelvis' own
 joints. If those joints are exact, they determine it; if they are noisy, the whole body does.
@@ -34,6 +37,9 @@ from steadypose.prior.models.weights import Arrays, load_weights
 DIMENSIONS, TURNS = 66, 3
 UNLIKE = 0.01
 """Standard deviation along an axis of a joint's difference from the postures of training people, metres."""
+
+UNMOVED = 0.01
+"""Variance added to that of a joint's move, relative to its noise: moves of a tenth of its deviation have no limit."""
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
 """Bounds of a joint's standard deviation, metres; an unknown joint has the upper bound."""
@@ -72,32 +78,50 @@ class Expected(NamedTuple):
 class LivePosture:
     """The Gaussian of `steadypose train posture`.
 
-    ``spread`` is a factor on its covariance: how much more people may differ from the mean than training people do.
     ``mean`` (66,) metres and ``covariance`` (66, 66) m² are of the joints of an adult in the trunk's frame.
     """
 
-    def __init__(self, weights: Arrays, spread: float = 1.0) -> None:
-        factor = weights["factor"].astype(np.float64)
-        whole, mean = spread * factor @ factor.T, weights["mean"].astype(np.float64)
+    def __init__(self, weights: Arrays) -> None:
+        factor, mean = weights["factor"].astype(np.float64), weights["mean"].astype(np.float64)
+        whole = factor @ factor.T
         self.mean, self._turn = mean[:DIMENSIONS], mean[DIMENSIONS:]
-        self.covariance = whole[:DIMENSIONS, :DIMENSIONS] + UNLIKE**2 * np.eye(DIMENSIONS)
+        self._of_training = np.ascontiguousarray(whole[:DIMENSIONS, :DIMENSIONS])
+        self.covariance = self._of_training + UNLIKE**2 * np.eye(DIMENSIONS)
         self._turned_by = np.linalg.solve(self.covariance, whole[:DIMENSIONS, DIMENSIONS:]).T
 
     @classmethod
-    def load(cls, weights: str, spread: float = 1.0) -> LivePosture:
+    def load(cls, weights: str) -> LivePosture:
         """Load the weights of this name; raises like `load_weights`."""
-        return cls(load_weights(weights, "posture")[0], spread)
+        return cls(load_weights(weights, "posture")[0])
 
-    def __call__(self, positions: Floats, sigma: Floats, lengths: Floats) -> Expected:
-        """Estimate joints (B, 22, 3) metres from noisy ones, their standard deviations (B, 22) along an axis, and the
-        lengths (B, 22) of each joint's bone, 0 for the root."""
+    def __call__(
+        self,
+        positions: Floats,
+        sigma: Floats,
+        lengths: Floats,
+        spread: Floats | float = 1.0,
+        limit: float = math.inf,
+    ) -> Expected:
+        """Estimate joints from noisy ones.
+
+        Args:
+            positions: (B, 22, 3) metres.
+            sigma: (B, 22) metres along an axis, their standard deviations.
+            lengths: (B, 22) metres, length of each joint's bone, 0 for the root.
+            spread: (B,) factor on the covariance: how much more this person may differ from the mean than training
+                people do.
+            limit: largest distance that the Gaussian moves a joint, in standard deviations of that distance.
+        """
         frame, middle = trunk_frame(positions), positions[:, list(_CORNERS)].mean(axis=1)
         size = lengths.sum(axis=-1) / _REST_SIZE
         scale = size[:, None, None]
         local = (positions - middle[:, None]) @ frame / scale
         noise = np.repeat(np.square(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA) / size[:, None]), 3, axis=1)
         off, left = local.reshape(len(local), -1) - self.mean, np.empty((len(local), DIMENSIONS, DIMENSIONS))
-        _condition(self.covariance, noise, off, left)
+        observed = off.copy()
+        _condition(self._of_training, np.full(len(local), spread), noise, off, left)
+        if limit < math.inf:
+            _limit(limit, noise, observed, off, left)
         local = (self.mean + off).reshape(local.shape)
         expected, left = on_bones(local * scale, left * scale**2, np.ascontiguousarray(lengths[:, 1:]))
         off = (expected / scale).reshape(len(local), -1) - self.mean
@@ -159,8 +183,9 @@ class RootCovariance:
 
 
 @njit(cache=True)
-def _condition(covariance, noise, off, left):
-    """Condition a zero-mean Gaussian of ``covariance`` (66, 66) on observations ``off`` (B, 66) of variance ``noise``.
+def _condition(covariance, spread, noise, off, left):
+    """Condition a zero-mean Gaussian of ``covariance`` (66, 66) times ``spread`` (B,), plus `UNLIKE` squared, on
+    observations ``off`` (B, 66) of variance ``noise``.
 
     Observations are processed one by one, because their errors are independent. The expectation is written to ``off``,
     the covariance to ``left`` (B, 66, 66).
@@ -170,7 +195,8 @@ def _condition(covariance, noise, off, left):
         for i in range(DIMENSIONS):
             expected[i] = 0.0
             for j in range(DIMENSIONS):
-                left[b, i, j] = covariance[i, j]
+                left[b, i, j] = spread[b] * covariance[i, j]
+            left[b, i, i] += UNLIKE**2
         for k in range(DIMENSIONS):
             innovation, variance = off[b, k] - expected[k], left[b, k, k] + noise[b, k]
             for i in range(DIMENSIONS):
@@ -182,6 +208,45 @@ def _condition(covariance, noise, off, left):
                     left[b, i, j] -= gain * column[j]
         for i in range(DIMENSIONS):
             off[b, i] = expected[i]
+
+
+@njit(cache=True)
+def _limit(limit, noise, observed, off, left):
+    """Limit the moves from ``observed`` to ``off`` (B, 66), in place, joint by joint, to ``limit`` standard deviations.
+
+    A joint's move has the covariance R - left, with its noise R and the covariance ``left`` (B, 66, 66) after it.
+    """
+    square, moved = np.empty((3, 3)), np.empty(3)
+    for b in range(len(off)):
+        for first in range(0, DIMENSIONS, 3):
+            for i in range(3):
+                moved[i] = off[b, first + i] - observed[b, first + i]
+                for j in range(3):
+                    square[i, j] = -left[b, first + i, first + j]
+                square[i, i] += (1.0 + UNMOVED) * noise[b, first + i]
+            _solve_three(square, moved)
+            ratio = 0.0
+            for i in range(3):
+                ratio += moved[i] * (off[b, first + i] - observed[b, first + i])
+            if ratio > limit**2:
+                share = limit / math.sqrt(ratio)
+                for i in range(3):
+                    off[b, first + i] = observed[b, first + i] + share * (off[b, first + i] - observed[b, first + i])
+
+
+@njit(cache=True)
+def _solve_three(matrix, vector):
+    """Solve a positive definite system (3, 3) by elimination; the solution overwrites ``vector`` (3,)."""
+    for i in range(3):
+        for row in range(i + 1, 3):
+            factor = matrix[row, i] / matrix[i, i]
+            for column in range(i, 3):
+                matrix[row, column] -= factor * matrix[i, column]
+            vector[row] -= factor * vector[i]
+    for i in range(2, -1, -1):
+        for column in range(i + 1, 3):
+            vector[i] -= matrix[i, column] * vector[column]
+        vector[i] /= matrix[i, i]
 
 
 def on_bones(mean: Floats, covariance: Floats, lengths: Floats) -> tuple[Floats, Floats]:

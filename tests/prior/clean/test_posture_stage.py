@@ -7,7 +7,7 @@ from tests.helpers.values import clean_bodies, estimate
 
 from steadypose.msgs.types import JointState
 from steadypose.prior.body.skeleton import REST_OFFSETS, REST_POSITIONS, J
-from steadypose.prior.clean.posture import AT_MOST, LITTLE, SHARE, SPREAD, Posture, mix
+from steadypose.prior.clean.posture import AT_MOST, LITTLE, NARROW, SHARE, WIDE, Posture, mix
 from steadypose.prior.clean.settings import PostureSettings
 from steadypose.prior.models.posture import LivePosture
 from steadypose.prior.sim.noise import time_correlated
@@ -36,9 +36,11 @@ def test_a_perfect_input_stays() -> None:
 def test_joints_move_a_share_of_the_way_and_in_white_noise_those_observed_are_then_surer() -> None:
     before = estimate(REST_POSITIONS + np.random.default_rng(1).normal(0.0, 0.02, (1, 22, 3)), 0.02)
     before.state[0, J["left_wrist"]] = JointState.IMPUTED
-    after = Posture(PostureSettings()).update(before, LENGTHS, NOISE, CERTAIN)
-    whole = LivePosture.load("default", SPREAD)(before.positions, before.sigma, LENGTHS).positions - before.positions
-    np.testing.assert_allclose(after.positions - before.positions, SHARE * whole, rtol=0.03, atol=1e-4)
+    for correlated, spread in ((0.0, WIDE), (0.5, 4.0), (1.0, NARROW)):
+        after = Posture(PostureSettings()).update(before, LENGTHS, NOISE, np.array([correlated]))
+        whole = LivePosture.load("default")(before.positions, before.sigma, LENGTHS, spread).positions
+        moved = SHARE * (whole - before.positions)
+        np.testing.assert_allclose(after.positions - before.positions, moved, rtol=0.03, atol=1e-4)
     assert np.linalg.norm(after.positions - REST_POSITIONS, axis=-1).mean() < 0.033
     np.testing.assert_array_equal(after.sigma, before.sigma, "joints whose errors last share them")
     surer = Posture(PostureSettings()).update(before, LENGTHS, NOISE, np.zeros(1)).sigma < before.sigma

@@ -83,9 +83,36 @@ def test_the_deviation_of_the_answer_is_honest(posture: LivePosture, joints: np.
 
 def test_a_wider_gaussian_moves_joints_less(posture: LivePosture, joints: np.ndarray) -> None:
     noisy, sigma = joints + np.random.default_rng(6).normal(0.0, 0.02, joints.shape), np.full((BODIES, 22), 0.02)
-    moved = [np.linalg.norm(p(noisy, sigma, LENGTHS).positions - noisy, axis=-1).mean()
-             for p in (posture, LivePosture.load("default", 8.0))]  # fmt: skip
-    assert moved[1] < 0.95 * moved[0]
+    own = np.where(np.arange(BODIES) < BODIES // 2, 1.0, 8.0)
+    once, wider, both = (posture(noisy, sigma, LENGTHS, spread).positions for spread in (1.0, 8.0, own))
+    assert np.linalg.norm(wider - noisy, axis=-1).mean() < 0.95 * np.linalg.norm(once - noisy, axis=-1).mean()
+    np.testing.assert_array_equal(both, np.where((own == 1.0)[:, None, None], once, wider))
+
+
+def test_a_joint_that_the_gaussian_moves_too_far_moves_less(posture: LivePosture, joints: np.ndarray) -> None:
+    seen, sigma, wrist = joints[:1].copy(), np.full((1, 22), 0.01), J["left_wrist"]
+    seen[0, wrist] += (0.0, 0.0, 0.5)  # far from where training people have it
+    bones = np.linalg.norm(seen - seen[:, PARENT], axis=-1)
+    free, limited = (posture(seen, sigma, bones, limit=limit).positions[0] - seen[0] for limit in (np.inf, 1.5))
+    assert np.linalg.norm(limited[wrist]) < 0.75 * np.linalg.norm(free[wrist])
+    assert limited[wrist] @ free[wrist] > 0.9 * np.linalg.norm(limited[wrist]) * np.linalg.norm(free[wrist])
+
+
+def test_moves_are_measured_in_their_own_standard_deviations(posture: LivePosture) -> None:
+    rng, count, sigma = np.random.default_rng(8), 400, 0.02
+    drawn = rng.multivariate_normal(posture.mean, posture.covariance + sigma**2 * np.eye(66), count)
+    left, off = np.empty((count, 66, 66)), drawn - posture.mean
+    noise, observed = np.full((count, 66), sigma**2), off.copy()
+    stage._condition(posture.covariance - stage.UNLIKE**2 * np.eye(66), np.ones(count), noise, off, left)
+    moved = (off - observed).reshape(count, 22, 3)
+    blocks = np.stack([left[:, k : k + 3, k : k + 3] for k in range(0, 66, 3)], axis=1)
+    ratio = np.einsum("bji,bji->bj", moved, np.linalg.solve(sigma**2 * np.eye(3) - blocks, moved[..., None])[..., 0])
+    assert 2.7 < ratio.mean() < 3.3, "a chi-squared distribution of three dimensions"
+    limited = off.copy()
+    stage._limit(1.5, noise, observed, limited, left)
+    share = np.linalg.norm((limited - observed).reshape(count, 22, 3), axis=-1) / np.linalg.norm(moved, axis=-1)
+    assert (share[ratio < 1.5**2] > 1.0 - 1e-9).all()
+    np.testing.assert_allclose(share, np.minimum(1.0, 1.5 / np.sqrt(ratio)), rtol=0.15)
 
 
 def test_lengths_of_bones_bring_joints_nearer_and_the_covariance_says_by_how_much(joints: np.ndarray) -> None:
