@@ -3,58 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field, fields, is_dataclass
-from functools import cache
 from typing import Any, get_args, get_type_hints
-
-logger = logging.getLogger(__name__)
 
 MODEL = "model"
 """Key of the metadata of a field that names weights; its value is the model's name."""
-
-RENAMED = {"prior.encode": "prior.reconstruct", "prior.bones": "prior.person", "server.kiosks": "server.clients"}
-"""Former names of settings in version 0.2. Version 0.3 accepts them with a warning; 0.4 refuses them."""
-
-UNUSED = {"prior.impute": ("steps", "rate")}
-"""Settings in version 0.2, ignored with a warning. Gradient ascent in the latents gained nothing."""
-
-
-def current_key(path: str) -> str:
-    """Return the current name of a setting's path, such as ``prior.bones.samples``, with or without its section."""
-    for old, new in RENAMED.items():
-        (section, _, was), now = old.partition("."), new.partition(".")[2]
-        for former, name in ((old, new), (was, now)):
-            if f"{path}.".startswith(f"{former}."):
-                _warn_once(f"[{section}] {was} is now called {now}: write that; a later version refuses {was}")
-                return name + path[len(former) :]
-    return path
-
-
-def current_keys(section: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a launch file's section under their current names, without those no longer used.
-
-    Raises:
-        ValueError: a setting is given under both names.
-    """
-    current: dict[str, Any] = {}
-    for key, value in settings.items():
-        name = current_key(f"{section}.{key}").rpartition(".")[2] if f"{section}.{key}" in RENAMED else key
-        if name != key and name in settings:
-            raise ValueError(f"[{section}] {key} is the former name of {name}: expected one of the two")
-        if unused := [k for k in UNUSED.get(f"{section}.{key}", ()) if isinstance(value, Mapping) and k in value]:
-            keys = ", ".join(unused)
-            _warn_once(f"[{section}.{key}] {keys}: no longer used, and to be refused by a later version")
-            value = {k: v for k, v in value.items() if k not in unused}
-        current[name] = value
-    return current
-
-
-@cache
-def _warn_once(text: str) -> None:
-    logger.warning(text)
 
 
 def build_settings(cls: type, settings: Mapping[str, Any], path: str) -> Any:

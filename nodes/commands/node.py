@@ -10,7 +10,6 @@ from steadypose.nodes.graph.node import supervisor_id
 from steadypose.nodes.graph.process import startup, stop_on_signals
 from steadypose.nodes.graph.topology import NODES, load
 from steadypose.nodes.settings import LaunchError
-from steadypose.prior.settings import logger as names_logger
 from steadypose.prior.settings import nearest
 
 
@@ -30,8 +29,6 @@ def node(arguments: Sequence[str]) -> None:
         help="override a setting of the launch file; repeatable",
     )
     given = parser.parse_args(arguments)
-    if supervisor_id():  # who started it has warned of former names already
-        names_logger.setLevel(logging.ERROR)
     launch = Launch.read(given.launch, given.set)
     if given.name not in NODES:
         raise LaunchError(f"no node {given.name!r}{nearest(given.name, NODES)}; there are {', '.join(NODES)}")

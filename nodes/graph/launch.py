@@ -28,7 +28,7 @@ from steadypose.nodes.graph.topology import (
 from steadypose.nodes.settings import LaunchError, launch_errors, load_plugin, resolve_paths
 from steadypose.prior.body.layouts import add_layouts
 from steadypose.prior.models.weights import check_weights
-from steadypose.prior.settings import build_settings, current_key, current_keys, nearest
+from steadypose.prior.settings import build_settings, nearest
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -85,7 +85,6 @@ class Launch(_EveryLaunch):
         table = read_toml(file)
         resolve_paths(_layout(table), table, file.parent)
         with launch_errors():
-            table = {name: current_keys(name, part) if isinstance(part, dict) else part for name, part in table.items()}
             for override in overrides:
                 apply_override(table, override)
             _add_plugins(table.get("plugins", {}))
@@ -210,7 +209,7 @@ def apply_override(table: dict[str, Any], override: str) -> None:
     path, separator, text = override.partition("=")
     if not separator or not path.strip():
         raise LaunchError(f"expected section.key=value, got {override!r}")
-    path = current_key(path.strip())
+    path = path.strip()
     try:
         value = _parse(f"value = {text}")["value"]
     except ValueError:
@@ -240,7 +239,7 @@ def full_key(override: str, sections: Mapping[str, type]) -> str:
     name or ending.
     """
     path, separator, value = override.partition("=")
-    name = current_key(path.strip())
+    name = path.strip()
     if not separator or not name:
         raise LaunchError(f"--set: expected section.key=value, got {override!r}")
     known = [f"{section}.{key}" for section, kind in sections.items() for key in _keys(kind)]
@@ -262,7 +261,7 @@ def check_settings(settings: Mapping[str, Mapping[str, Any]]) -> None:
     """Raise LaunchError for wrong settings of `PIPELINES`, or missing weights, without loading them."""
     with launch_errors():
         for section, kind in pipeline_sections().items():
-            check_weights(build_settings(kind, current_keys(section, settings.get(section, {})), section))
+            check_weights(build_settings(kind, settings.get(section, {}), section))
 
 
 def check_weights_of(launch: Launch) -> None:
@@ -284,7 +283,7 @@ def in_launch_file(launch: str | Path, overrides: Sequence[str]) -> list[str]:
     kinds = {setting.name: "" for setting in fields(_EveryLaunch)} | _SECTIONS_OF_ALL | _sections()
     full = []
     for override in overrides:
-        first = current_key(override.partition("=")[0].strip()).partition(".")[0]
+        first = override.partition("=")[0].strip().partition(".")[0]
         if kinds.get(first) == "":  # free-form
             full.append(override)
         else:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
-from steadypose.prior.settings import build_settings, check_range, current_keys, weights_setting
+from steadypose.prior.settings import build_settings, check_range, weights_setting
 
 MAX_DELAY = 16  # longest delay that the mixture of smoothers is trained for, frames
 
@@ -217,4 +217,4 @@ class PriorSettings:
         Raises:
             ValueError: for an unknown key (the message names the most similar one) or a wrong type.
         """
-        return build_settings(cls, current_keys("prior", settings), "prior")
+        return build_settings(cls, settings, "prior")

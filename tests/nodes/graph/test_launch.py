@@ -10,7 +10,6 @@ import pytest
 
 from steadypose.msgs.topics import DIAGNOSTICS, POSE_WORLD, TOPICS
 from steadypose.nodes.extras import EXTRAS
-from steadypose.nodes.graph import launch as module
 from steadypose.nodes.graph import topology
 from steadypose.nodes.graph.launch import Launch, bundled, check_weights_of, find, in_launch_file
 from steadypose.nodes.graph.node import Node
@@ -19,8 +18,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sinks.recorder import RecorderSettings
 from steadypose.nodes.sources.registry import SOURCES, InputSettings, open_input
 from steadypose.nodes.sources.source import LiveSource, SourceContext
-from steadypose.prior.clean.settings import PersonSettings, PriorSettings
-from steadypose.prior.settings import _warn_once
+from steadypose.prior.clean.settings import PriorSettings
 
 
 @pytest.fixture
@@ -182,35 +180,6 @@ def test_who_must_hear_whom(write) -> None:
     assert launch.reliable_subscribers("recorder") == frozenset()
     live = Launch.read(write("[transport]\nlossless = false"))
     assert live.reliable_subscribers("pose_input") == frozenset(), "a camera waits for nobody"
-
-
-@pytest.mark.parametrize(("text", "override", "former"), [
-    ("[prior.bones]\nevery = 4", "prior.bones.samples=40", ["bones"]),
-    ("[prior.person]\nevery = 4", "bones.samples=40", ["bones"]),
-    ("[prior.bones]\nevery = 4", "person.samples=40", ["bones"]),
-    ("[prior.bones]\nevery = 4\nsamples = 40\n[prior.encode]", "delay=4", ["bones", "encode"]),
-])  # fmt: skip
-def test_former_names_mean_the_new_ones(write, caplog, text: str, override: str, former: list[str]) -> None:
-    _warn_once.cache_clear()
-    launch = Launch.read(write(text), [module.full_key(override, module.pipeline_sections())])
-    assert launch.settings(PriorSettings).person == PersonSettings(samples=40, every=4)
-    warned = [record.getMessage().split()[1] for record in caplog.records]
-    assert sorted(warned) == former, "once each"
-
-
-def test_former_names_elsewhere(write, caplog: pytest.LogCaptureFixture) -> None:
-    _warn_once.cache_clear()
-    address = "tcp://127.0.0.1:7111"
-    file = write(f"nodes = ['prior']\n[server]\nkiosks = ['{address}']\n[transport]\nlossless = false")
-    assert Launch.read(file).server.clients == [address]
-    assert "[server] kiosks is now called clients" in caplog.text
-    assert Launch.read(file, ["server.clients=[]"]).server.clients == []
-    settings = PriorSettings.from_dict({"bones": {"samples": 40}})
-    assert settings.person.samples == 40
-    with pytest.raises(LaunchError, match="bones is the former name of person: expected one of the two"):
-        Launch.read(write("[prior.bones]\nsamples = 40\n[prior.person]\nsamples = 40"))
-    with pytest.raises(ValueError, match="did you mean 'person'"):
-        PriorSettings.from_dict({"persn": {}})
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -11,7 +11,6 @@ from steadypose.prior.clean.frame import BodyWindows
 from steadypose.prior.clean.history import History
 from steadypose.prior.clean.impute import CARRY_FRAMES, _carried
 from steadypose.prior.clean.reconstruct import MODEL_SIGMA, NOISE_LEFT, SETTLED, Denoise, Reconstruct, _place_pelvis
-from steadypose.prior.clean.settings import ImputeSettings, PriorSettings
 from steadypose.prior.timing.kalman import Smoothed
 
 
@@ -223,8 +222,3 @@ def test_switched_off_hidden_joints_follow_the_refinement_model() -> None:
     scored = clean_bodies(hidden_arm(45, 30), delay=0, **refined)
     assert all((a.positions == b.positions).all() for a, b in zip(off, scored, strict=True))
     assert all((b.state[ARM] == JointState.IMPUTED).all() for b in off[30:])
-
-
-def test_keys_of_the_version_before_are_ignored_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
-    assert PriorSettings.from_dict({"impute": {"steps": 2, "enabled": False}}).impute == ImputeSettings(enabled=False)
-    assert "[prior.impute] steps: no longer used" in caplog.text
