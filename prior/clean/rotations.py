@@ -98,7 +98,7 @@ class Orient:
             return estimate
         positions, sigma, offsets = estimate.positions[slots], estimate.sigma[slots], estimate.offsets[slots]
         expected = self._posture(positions, sigma, np.linalg.norm(offsets, axis=-1), limit=LIMIT)
-        root = average_root(expected, positions, sigma, offsets)
+        root = average_root(self._posture.root(expected), positions, sigma, offsets)
         turned = global_rotations(solve_rotations(expected.positions, offsets, estimate.rotations[slots], root))
         twist, turns = self._twist[slots], self._turns[slots]
         follow_twist(turned, offsets, sigma, twist)

@@ -71,8 +71,16 @@ class Expected(NamedTuple):
 
     positions: Floats  # (B, 22, 3) metres
     sigma: Floats  # (B, 22) metres, their standard deviations along an axis
-    root: Floats  # (B, 3, 3) orientations of the pelvis
-    root_covariance: Floats  # (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise
+    frame: Floats  # (B, 3, 3) axes of the trunk as columns
+    adult: Floats  # (B, 66) metres, the joints of an adult in that frame, less the mean
+    covariance: Floats  # (B, 66, 66) m² of them
+
+
+class Root(NamedTuple):
+    """Orientations of the pelvis of B bodies, as their postures show them."""
+
+    orientation: Floats  # (B, 3, 3)
+    covariance: Floats  # (B, 3, 3) rad² about the pelvis' axes, the part that is caused by the joints' noise
 
 
 class LivePosture:
@@ -125,10 +133,14 @@ class LivePosture:
         local = (self.mean + off).reshape(local.shape)
         expected, left = on_bones(local * scale, left * scale**2, np.ascontiguousarray(lengths[:, 1:]))
         off = (expected / scale).reshape(len(local), -1) - self.mean
-        root = frame @ from_rotation_vectors(self._turn + off @ self._turned_by.T)
-        turned = self._turned_by @ left @ self._turned_by.T / scale**2
         variance = np.diagonal(left, axis1=1, axis2=2).reshape(-1, 22, 3).mean(axis=-1)
-        return Expected(expected @ frame.swapaxes(-1, -2) + middle[:, None], np.sqrt(variance), root, turned)
+        placed = expected @ frame.swapaxes(-1, -2) + middle[:, None]
+        return Expected(placed, np.sqrt(variance), frame, off, left / scale**2)
+
+    def root(self, expected: Expected) -> Root:
+        """Return the orientation of the pelvis that goes with these joints."""
+        turned = from_rotation_vectors(self._turn + expected.adult @ self._turned_by.T)
+        return Root(expected.frame @ turned, self._turned_by @ expected.covariance @ self._turned_by.T)
 
     def misfit(self, positions: Floats, sigma: float) -> Floats:
         """(N,) half the squared Mahalanobis distance of one body's joints in N orders (N, 22, 3), metres, NaN where
@@ -156,13 +168,13 @@ class LivePosture:
         return np.sqrt(np.maximum(np.diagonal(left), 0.0).reshape(22, 3).mean(axis=1))
 
 
-def average_root(expected: Expected, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
+def average_root(root: Root, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
     """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances:
     observed joints (B, 22, 3) metres, deviations (B, 22) along an axis and bones (B, 22, 3)."""
-    known, rigid = expected.root_covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
-    off = to_rotation_vectors(expected.root.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
+    known, rigid = root.covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
+    off = to_rotation_vectors(root.orientation.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
     share = known @ np.linalg.inv(known + rigid)
-    return expected.root @ from_rotation_vectors((share @ off[..., None])[..., 0])
+    return root.orientation @ from_rotation_vectors((share @ off[..., None])[..., 0])
 
 
 class RootCovariance:
@@ -176,7 +188,8 @@ class RootCovariance:
         3) metres, deviations (B, 22) along an axis and orientations of the pelvis (B, 3, 3)."""
         bones = positions - positions[:, PARENT]
         bones[:, 0] = 0.0
-        known = self._posture(positions, sigma, np.linalg.norm(bones, axis=-1)).root_covariance + np.diag(WITHIN**2)
+        expected = self._posture(positions, sigma, np.linalg.norm(bones, axis=-1))
+        known = self._posture.root(expected).covariance + np.diag(WITHIN**2)
         rigid = rigid_covariance(sigma, bones @ root)
         covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
         return root @ covariance @ root.swapaxes(-1, -2)

@@ -136,7 +136,8 @@ def test_the_answer_turns_with_the_body_however_it_lies(posture: LivePosture, jo
 
 def _root(posture: LivePosture, joints: np.ndarray, sigma: float) -> np.ndarray:
     deviations = np.full((BODIES, 22), sigma)
-    return stage.average_root(posture(joints, deviations, LENGTHS), joints, deviations, OFFSETS)
+    root = posture.root(posture(joints, deviations, LENGTHS))
+    return stage.average_root(root, joints, deviations, OFFSETS)
 
 
 def _angles(turned: np.ndarray, true: np.ndarray) -> np.ndarray:
