@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from steadypose.msgs.types import JOINTS, Level, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.problem import Problem, bodies, error, observed, some_bodies, tracks, warning
-from steadypose.prior.body.layouts import SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, layout_names, to_canonical
 from steadypose.prior.body.likeness import likenesses
 from steadypose.prior.body.skeleton import finite_joints
 from steadypose.prior.clean.admission import MAX_PLACE
@@ -60,7 +60,7 @@ def _unknown(messages: Sequence[PoseRaw], count: int) -> Problem:
     name = messages[-1].skeleton
     like = _best(messages, count)
     hint = f"{_named_like(name)}; its {count} joints are most like {like!r}" if like else _named_like(name)
-    expected = f"expected one of {', '.join(SKELETONS)}; for a layout of your own, see docs/sources.md"
+    expected = f"expected one of {layout_names()}; for a layout of your own, see docs/sources.md"
     return error("unknown_skeleton", f"skeleton {name!r}{hint}: {expected}")
 
 

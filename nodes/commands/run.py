@@ -31,7 +31,8 @@ from steadypose.nodes.settings import STREAMS, located, printable
 from steadypose.nodes.sinks.recorder import RecorderSettings, free_directory
 from steadypose.nodes.sources.recording import DAMAGE, VIDEOS
 
-LINE_NS = 5_000_000_000  # between lines where there is no terminal for a table
+LINE_NS, LINE_LATER_NS = 5_000_000_000, 60_000_000_000
+"""Between lines where there is no terminal for a table, in the first minute and later."""
 REPORT_NS = 1_000_000_000  # between writes of the health file
 REPLAY = "replay"
 STALL_NS = 15_000_000_000
@@ -133,7 +134,7 @@ class _Run:
         waited_for = frozenset[str]().union(*map(launch.reliable_subscribers, POSE_NODES))
         self._required = {name for name in launch.nodes if not NODES[name].optional or name in waited_for}
         self._without: list[str] = []
-        self._progress_ns = self._printed_ns = clock.monotonic_ns()
+        self._progress_ns = self._printed_ns = self._started_ns = clock.monotonic_ns()
         self._reported_ns = 0
         self._ready = False
 
@@ -236,8 +237,10 @@ class _Run:
         if live:
             with suppress(OSError):
                 live.update(table(self._launch.nodes, self._diagnostics, supervisor, self._console.width), refresh=True)
-        elif self._clock.monotonic_ns() - self._printed_ns >= LINE_NS:
-            self._printed_ns = self._clock.monotonic_ns()
+            return
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - self._printed_ns >= (LINE_NS if now_ns - self._started_ns < LINE_LATER_NS else LINE_LATER_NS):
+            self._printed_ns = now_ns
             for text in lines(self._launch.nodes, self._diagnostics, supervisor):
                 self._print(text)
 

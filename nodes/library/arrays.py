@@ -28,7 +28,7 @@ from steadypose.nodes.sinks.plot.history import history_of_arrays, history_of_pa
 from steadypose.nodes.sources.npz import ArraySource, NpzError, as_input
 from steadypose.nodes.sources.recording import open_recording
 from steadypose.nodes.sources.source import RecordedSource
-from steadypose.prior.body.layouts import CANONICAL, add_layouts
+from steadypose.prior.body.layouts import CANONICAL, DESCRIBED, add_layouts
 from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def skeleton_name(skeleton: SkeletonLike) -> str:
     described = dict(skeleton) if isinstance(skeleton, Mapping) else {"joints": skeleton}
     if isinstance(joints := described.get("joints"), Iterable) and not isinstance(joints, str):
         described["joints"] = [str(joint) for joint in joints]
-    name = "own_" + hashlib.sha256(json.dumps(described, sort_keys=True, default=list).encode()).hexdigest()[:12]
+    name = DESCRIBED + hashlib.sha256(json.dumps(described, sort_keys=True, default=list).encode()).hexdigest()[:12]
     try:
         add_layouts({name: described})
     except ValueError as error:

@@ -24,7 +24,7 @@ from steadypose.nodes.library.poses import Poses
 from steadypose.nodes.sinks.arrays import NpzCollector
 from steadypose.nodes.sources.npz import STAMPS_END_NS
 from steadypose.nodes.timeline import FrameEvents, TimedEvent
-from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.layouts import SKELETONS, layout_names
 from steadypose.prior.clean.pipeline import load_loops
 from steadypose.prior.clean.settings import PriorSettings
 from steadypose.prior.events.detector import EventSettings
@@ -73,7 +73,7 @@ class Filter:
         self._skeleton = skeleton_name(skeleton)
         if self._skeleton not in SKELETONS:
             hint = skeleton_hint(self._skeleton, ())
-            raise FilterError(f"skeleton: expected one of {', '.join(SKELETONS)}, got {skeleton!r}{hint}")
+            raise FilterError(f"skeleton: expected one of {layout_names()}, got {skeleton!r}{hint}")
         _check_pose(sensor_pose)
         self._pose, self._calibrated = sensor_pose or Pose.from_up(up), sensor_pose is not None
         given = sections(settings, delay)

@@ -19,7 +19,7 @@ from steadypose.nodes.graph.clock import FRAME_NS
 from steadypose.nodes.sources.npz import NpzError, read_arrays, read_stamps
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.kinematics import rotation_matrix
-from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.layouts import SKELETONS, layout_names
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS
 from steadypose.prior.camera.key_points import KeyPointRecording, in_sight
 
@@ -60,7 +60,7 @@ def read_key_points(path: Path) -> KeyPointRecording:
                        f"than {HIGHEST:g}, got {height!r:.80}")  # fmt: skip
     name = str(arrays["skeleton"])
     if name not in SKELETONS:
-        raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {name!r}")
+        raise NpzError(f"{path}: skeleton: expected one of {layout_names()}, got {name!r}")
     layout, keypoints = SKELETONS[name], np.asarray(arrays["keypoints"], dtype=np.float64)
     joints = len(layout.joints)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (joints, 2) or len(keypoints) < 2:

@@ -23,7 +23,7 @@ from steadypose.msgs.topics import POSE_RAW
 from steadypose.msgs.types import OBSERVED, Message, Pose, PoseRaw, RawBody
 from steadypose.nodes.checks.layout import axes_hint, count_hint, skeleton_hint, stamps_hint
 from steadypose.nodes.settings import as_text
-from steadypose.prior.body.layouts import CANONICAL, SKELETONS
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, layout_names
 from steadypose.prior.clean.admission import MAX_DISTANCE
 from steadypose.prior.npz import check_arrays
 
@@ -74,7 +74,7 @@ class ArraySource:
         self._skeleton = _text(path, arrays, "skeleton")
         if self._skeleton not in SKELETONS:
             hint = skeleton_hint(self._skeleton, np.shape(arrays.get("positions", ())))
-            raise NpzError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {self._skeleton!r}{hint}")
+            raise NpzError(f"{path}: skeleton: expected one of {layout_names()}, got {self._skeleton!r}{hint}")
         joints = len(SKELETONS[self._skeleton].joints)
         positions = _numbers(path, arrays, "positions")
         if positions.ndim not in (3, 4) or positions.shape[-2:] != (joints, 3):

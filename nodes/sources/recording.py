@@ -25,7 +25,7 @@ from steadypose.nodes.extras import require_extra
 from steadypose.nodes.settings import STREAMS, LaunchError, as_text, located
 from steadypose.nodes.sources.npz import MotionSource, NpzSource, holds_motion
 from steadypose.nodes.sources.source import CalibrationSettings, RecordedSource, WebcamSettings
-from steadypose.prior.body.layouts import SKELETONS, Skeleton
+from steadypose.prior.body.layouts import SKELETONS, Skeleton, layout_names
 from steadypose.prior.clean.admission import SLOWEST_NS
 from steadypose.prior.settings import nearest
 
@@ -323,7 +323,7 @@ def _skeleton(path: Path, columns: list[str], named: str | None) -> Skeleton:
         got = f"missing: {', '.join(lone[:5])}" if lone else f"got none among {', '.join(columns[:8])}"
         raise CsvError(f"{path}: expected columns JOINT_x, JOINT_y and JOINT_z for each joint; {got}")
     if named is not None and named not in SKELETONS:
-        raise CsvError(f"{path}: skeleton: expected one of {', '.join(SKELETONS)}, got {named!r}")
+        raise CsvError(f"{path}: skeleton: expected one of {layout_names()}, got {named!r}")
     for skeleton in [SKELETONS[named]] if named else SKELETONS.values():
         if joints <= set(skeleton.joints):
             return skeleton

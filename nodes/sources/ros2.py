@@ -24,7 +24,7 @@ from steadypose.nodes.settings import LaunchError
 from steadypose.nodes.sources.adapters import from_azure_kinect, from_pose_array
 from steadypose.nodes.sources.source import LiveSource, SourceContext
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import SKELETONS
+from steadypose.prior.body.layouts import SKELETONS, layout_names
 from steadypose.prior.settings import nearest
 
 if TYPE_CHECKING:
@@ -243,7 +243,7 @@ class Ros2Source(LiveSource):
         check_ros()
         if (name := settings.skeleton) not in SKELETONS:
             got = f"{name!r}{nearest(name, SKELETONS)}"
-            raise LaunchError(f"[input.ros2] skeleton: expected one of {', '.join(SKELETONS)}, got {got}")
+            raise LaunchError(f"[input.ros2] skeleton: expected one of {layout_names()}, got {got}")
         self._settings = settings
         self._queue: deque[PoseRaw] = deque()
         self._received = 0

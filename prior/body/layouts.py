@@ -90,6 +90,8 @@ _SKELETONS: dict[str, Skeleton] = {CANONICAL.name: CANONICAL}
 SKELETONS: Mapping[str, Skeleton] = MappingProxyType(_SKELETONS)
 """All skeletons that ``pose/raw`` may name: the bundled ones and the user's own (`add_layouts`)."""
 
+DESCRIBED = "own_"  # beginning of the name of a layout that a program described instead of naming
+
 
 def middles(ends: Mapping[str, str]) -> dict[str, dict[str, float]]:
     """Return the entries of a table for pelvis, neck and head, as far as these are means of ``ends``.
@@ -103,6 +105,11 @@ def middles(ends: Mapping[str, str]) -> dict[str, dict[str, float]]:
         if weights.keys() <= ends.keys():
             table[middle] = {ends[end]: weight for end, weight in weights.items()}
     return table
+
+
+def layout_names() -> str:
+    """Return the names of all layouts, for messages; without those that a program described instead of naming."""
+    return ", ".join(name for name in SKELETONS if not name.startswith(DESCRIBED))
 
 
 def add_layouts(descriptions: Mapping[str, Any]) -> None:

@@ -18,7 +18,7 @@ from steadypose.msgs.types import CleanBody, JointState, PoseClean, PoseRaw
 from steadypose.prior.arrays import Floats
 from steadypose.prior.body.bone_lengths import estimate_offsets
 from steadypose.prior.body.kinematics import CONTACT_JOINTS, REST_HEIGHT, SensorFrame, heading, quaternions, yaw_matrix
-from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, layout_names, to_canonical
 from steadypose.prior.body.skeleton import PARENTS, REST_OFFSETS, at_origin, finite_joints
 from steadypose.prior.complete.body import Completed, Fill, Uncertainty, complete
 from steadypose.prior.complete.samples import draw
@@ -125,7 +125,7 @@ def _stretches(source: str, raws: Sequence[PoseRaw], anchor_ns: int) -> list[Str
     for message in raws:
         if message.skeleton not in SKELETONS:
             raise CompletionError(
-                f"{source}: skeleton {message.skeleton!r} is not known: expected one of {', '.join(SKELETONS)}, or one "
+                f"{source}: skeleton {message.skeleton!r} is not known: expected one of {layout_names()}, or one "
                 "of your own by --skeletons"
             )
         sensor = SensorFrame.of(message.sensor_pose)

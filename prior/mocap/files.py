@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from steadypose.prior.arrays import Floats
-from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, to_canonical
+from steadypose.prior.body.layouts import CANONICAL, SKELETONS, Skeleton, layout_names, to_canonical
 from steadypose.prior.body.rigs import BY_RIG, Rig, Tree, recognise, recognise_points, up_axis
 from steadypose.prior.body.skeleton import JOINTS, PARENTS, REST_OFFSETS
 from steadypose.prior.mocap.bvh import CMU_BVH, read_bvh
@@ -73,7 +73,7 @@ def describe(table: Mapping[str, Any]) -> Description:
     if described.up not in ("", *TO_Z_UP):
         raise MotionError(f"rig: up: expected one of {', '.join(TO_Z_UP)}, got {described.up!r}")
     if described.skeleton not in ("", *SKELETONS):
-        raise MotionError(f"rig: skeleton: expected one of {', '.join(SKELETONS)}, got {described.skeleton!r}")
+        raise MotionError(f"rig: skeleton: expected one of {layout_names()}, got {described.skeleton!r}")
     return described
 
 

@@ -120,6 +120,9 @@ def test_a_layout_of_ones_own(joints: np.ndarray) -> None:
     for skeleton in (names, {"joints": own, "canonical": table}):
         given = steadypose.clean(alone[:, order], fps=30, skeleton=skeleton)
         np.testing.assert_allclose(given["positions"], expected, atol=1e-6)
+    with pytest.raises(ValueError, match="expected one of smpl22") as raised:
+        steadypose.Filter(skeleton="mine")
+    assert "own_" not in str(raised.value)
     with pytest.raises(ValueError, match="expected to find left_hip"):
         steadypose.Filter(skeleton=["a", "b"])
 

@@ -27,7 +27,7 @@ from steadypose.msgs.types import (
 )
 from steadypose.nodes.sinks.drawing import ALL_BONES, CONTACT_INDICES, SIDES, bone_states, bones, facing, to_world
 from steadypose.nodes.sinks.viewer import layout
-from steadypose.prior.body.layouts import SKELETONS, to_canonical
+from steadypose.prior.body.layouts import SKELETONS, layout_names, to_canonical
 from steadypose.prior.body.skeleton import HIPS, SHOULDERS, J
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class PoseView:
 
         skeleton = SKELETONS.get(message.skeleton)
         if skeleton is None:
-            raise ValueError(f"unknown skeleton {message.skeleton!r}: expected one of {', '.join(SKELETONS)}")
+            raise ValueError(f"unknown skeleton {message.skeleton!r}: expected one of {layout_names()}")
         pairs = bones(skeleton.observable)
         for body in message.bodies:
             if len(body.positions) != len(skeleton.joints):

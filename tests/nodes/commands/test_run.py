@@ -232,3 +232,18 @@ def test_what_goes_wrong_is_printed_when_it_does(make_launch: Callable[..., Laun
         "prior: ERROR: stamp is 0: expected more [stamps_zero]",
         "prior: no longer: stamps_zero",
     ]
+
+
+def test_without_a_terminal_lines_come_every_five_seconds_and_after_a_minute_every_minute(
+    make_launch: Callable[..., Launch], clock: VirtualClock
+) -> None:
+    console = Console(width=140, record=True)
+    run = _Run(make_launch(nodes='["prior"]'), [], console, clock, "", True)
+    run._receive(news("prior"), Processes("prior"))  # type: ignore[arg-type]
+    printed = []
+    for second in range(1, 301):
+        clock.time_ns += 10**9
+        run._show(Processes("prior"), None)  # type: ignore[arg-type]
+        if console.export_text():
+            printed.append(second)
+    assert printed == [*range(5, 60, 5), 115, 175, 235, 295]
