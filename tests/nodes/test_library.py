@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.nodes.conftest import walked, write_npz
 
 import steadypose
 from steadypose.msgs.types import PoseRaw
 from steadypose.nodes.cli import main
 from steadypose.nodes.library.arrays import as_array, source_of
-from steadypose.prior.body.skeleton import J
+from steadypose.prior.body.kinematics import global_rotations
+from steadypose.prior.body.skeleton import REST_OFFSETS, J
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "library.md").read_text(), re.MULTILINE | re.DOTALL)
@@ -225,3 +227,16 @@ def test_a_fit_is_that_of_the_command(tmp_path: Path) -> None:
     assert of_bodies.positions.shape == (40, 2, 22, 3)
     with pytest.raises(ValueError, match="points: expected numbers of one shape"):
         steadypose.fit(joints, fps=30.0, points=[joints[0], joints[1, :5]])
+
+
+def test_an_arm_stretched_farther_than_most_training_people_do_is_turned_as_its_joints_lie() -> None:
+    """It was turned by 28 degrees, because few postures are like it."""
+    elbow, shoulder, part = J["right_elbow"], J["right_shoulder"], slice(180, 228)
+    poses = steadypose.clean(steadypose.sample("reach").positions[: part.stop + 4], fps=30)
+    turned = global_rotations(
+        Rotation.from_quat(poses.rotations[part].reshape(-1, 4)).as_matrix().reshape(-1, 22, 3, 3)
+    )
+    bone = turned[:, shoulder] @ REST_OFFSETS[elbow]
+    shown = poses.positions[part, elbow] - poses.positions[part, shoulder]
+    cosine = (bone * shown).sum(axis=-1) / np.linalg.norm(bone, axis=-1) / np.linalg.norm(shown, axis=-1)
+    assert np.degrees(np.arccos(cosine)).mean() < 18
