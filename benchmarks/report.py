@@ -25,7 +25,7 @@ _NARROW = "measured before the Gaussian of postures was narrower in time-correla
 STALE: dict[str, str] = {
     **dict.fromkeys(
         ("ablations", "contacts", "counter", "event_mocap", "events", "fidelity", "heading", "hidden_joints", "humor",
-         "layouts", "mediapipe", "noisy_joints", "rotations", "world"),
+         "layouts", "noisy_joints", "world"),
         _NARROW,
     ),
     **dict.fromkeys(("latency", "restart", "retarget", "scale"), _CORRELATED),
