@@ -30,7 +30,7 @@ from steadypose import PACKAGE
 
 logger = logging.getLogger(__name__)
 
-LOOPS = 163  # number of entries that the nodes need with the default settings
+LOOPS = 165  # number of entries that the nodes need with the default settings
 COMPLETE = "complete"  # name of a file beside the entries: the digest of the sources for which all entries exist
 _OTHERS = 3  # number of folders of other versions and processors that are kept
 _UNFINISHED = ".unfinished-"
