@@ -24,8 +24,8 @@ _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints
 _NARROW = "measured before the Gaussian of postures was narrower in time-correlated noise: joints in it are now nearer"
 STALE: dict[str, str] = {
     **dict.fromkeys(
-        ("ablations", "counter", "event_mocap", "events", "hidden_joints", "humor",
-         "noisy_joints", "world"),
+        ("ablations", "event_mocap", "events", "hidden_joints", "humor",
+         "noisy_joints"),
         _NARROW,
     ),
     **dict.fromkeys(("latency", "restart", "retarget", "scale"), _CORRELATED),
