@@ -24,7 +24,7 @@ _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints
 _NARROW = "measured before the Gaussian of postures was narrower in time-correlated noise: joints in it are now nearer"
 STALE: dict[str, str] = {
     **dict.fromkeys(
-        ("ablations", "event_mocap", "events", "hidden_joints", "humor",
+        ("ablations", "hidden_joints", "humor",
          "noisy_joints"),
         _NARROW,
     ),
