@@ -23,11 +23,7 @@ from steadypose.benchmarks.results import load
 _CORRELATED = "measured before HG-VAE denoised time-correlated noise too: joints that are observed in it are now nearer"
 _NARROW = "measured before the Gaussian of postures was narrower in time-correlated noise: joints in it are now nearer"
 STALE: dict[str, str] = {
-    **dict.fromkeys(
-        ("ablations", "hidden_joints", "humor",
-         "noisy_joints"),
-        _NARROW,
-    ),
+    **dict.fromkeys(("ablations", "hidden_joints", "humor"), _NARROW),
     **dict.fromkeys(("latency", "restart", "retarget", "scale"), _CORRELATED),
     "soak": "measured before the steady stage and the fast matrix products, on which its losses depend little",
 }  # fmt: skip
