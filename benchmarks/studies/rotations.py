@@ -43,7 +43,7 @@ from steadypose.prior.clean.settings import OrientSettings, PriorSettings, Refin
 from steadypose.prior.fit.bodies import lowest_floor
 from steadypose.prior.fit.solve import FitSettings
 from steadypose.prior.fit.windows import Track, fit_track
-from steadypose.prior.models.posture import RootCovariance
+from steadypose.prior.models.pelvis import RootCovariance
 from steadypose.prior.timing.rate import FPS
 
 DEPENDS_ON = (*VARIANTS_22, "humor weights", "prior.fit")

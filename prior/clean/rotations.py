@@ -25,7 +25,8 @@ from steadypose.prior.clean.frame import Estimate, Gated, Person
 from steadypose.prior.clean.history import Ring
 from steadypose.prior.clean.settings import OrientSettings, RefineSettings
 from steadypose.prior.models.hmvae import LiveHMVAE
-from steadypose.prior.models.posture import LivePosture, average_root
+from steadypose.prior.models.pelvis import average_root
+from steadypose.prior.models.posture import LivePosture
 
 LIMIT = 1.5
 """Limit of the moves of joints, in their standard deviations: few training people raise an arm as high as some do."""

@@ -11,14 +11,6 @@ The Gaussian does not depend on the body's orientation in the world, so a body m
 
 Under a Gaussian, postures unlike those of training people are too unlikely. `LivePosture` therefore takes a factor on
 its covariance, and a limit on how far a joint moves, relative to what the Gaussian predicts of such moves.
-
-The rotation of the pelvis in that frame is another vector of the Gaussian, so it is also estimated from shoulders,
-spine and thighs. The root's rotation is a weighted average of this estimate and the estimate from the pelvis' own
-joints. If those joints are exact, they determine it; if they are noisy, the whole body does.
-
-The pelvis is a rigid part with both hips and the lowest spine joint. The line to the chest is three times as long and
-less noisy, but bends with the spine. The orientation of the pelvis in motion files differs by 0.9 degrees (median) from
-that of the rigid part, and by 3.4 degrees from the frame of hips and chest (validation people).
 """
 
 from __future__ import annotations
@@ -29,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from steadypose.prior.arrays import Bools, Floats
-from steadypose.prior.body.kinematics import from_rotation_vectors, to_rotation_vectors
-from steadypose.prior.body.skeleton import HIPS, MIRROR, PARENT, REST_LENGTHS, SHOULDERS, J
+from steadypose.prior.body.kinematics import from_rotation_vectors
+from steadypose.prior.body.skeleton import HIPS, MIRROR, PARENT, REST_LENGTHS, SHOULDERS
 from steadypose.prior.compiled import njit
 from steadypose.prior.models.weights import Arrays, load_weights
 
@@ -47,23 +39,10 @@ MIN_SIGMA, MAX_SIGMA = 1e-5, 0.5
 LENGTH_SIGMA = 0.01  # assumed standard deviation of a person's bone lengths, metres
 _ROUNDS = 2
 
-LEAST_SIGMA = math.radians(0.5)
-"""Least standard deviation of the root's rotation about an axis, for any sensor, radians."""
-
-WITHIN = np.radians((1.5, 4.0, 5.0))
-"""Standard deviations about the pelvis' axes of its rotation, given exact joints of the rest of the body, radians."""
-
-DEPENDENT = 1.7
-"""Factor on the covariance of the averaged root, because the two estimates share most noise (validation people)."""
-
 MIN_SIZE = 0.05  # least size of a body whose postures are compared, relative to an adult's: joints may coincide
 
 _CORNERS = (*HIPS, *SHOULDERS)
 _REST_SIZE = float(REST_LENGTHS.sum())
-
-_CARRIED = (*HIPS, J["spine1"])
-_LEAST = 1e-6
-"""Moment added to a body's moments, so that bones without length cause no division by zero, m²."""
 
 
 class Expected(NamedTuple):
@@ -166,33 +145,6 @@ class LivePosture:
             across = self.covariance[:, rows]
             left -= across @ np.linalg.solve(self.covariance[np.ix_(rows, rows)], across.T)
         return np.sqrt(np.maximum(np.diagonal(left), 0.0).reshape(22, 3).mean(axis=1))
-
-
-def average_root(root: Root, positions: Floats, sigma: Floats, offsets: Floats) -> Floats:
-    """Average the root's orientations (B, 3, 3) from the posture and from the pelvis' own joints by their covariances:
-    observed joints (B, 22, 3) metres, deviations (B, 22) along an axis and bones (B, 22, 3)."""
-    known, rigid = root.covariance + np.diag(WITHIN**2), rigid_covariance(sigma, offsets)
-    off = to_rotation_vectors(root.orientation.swapaxes(-1, -2) @ rigid_pelvis(positions, offsets))
-    share = known @ np.linalg.inv(known + rigid)
-    return root.orientation @ from_rotation_vectors((share @ off[..., None])[..., 0])
-
-
-class RootCovariance:
-    """The covariance of a root's orientation, which messages do not carry, of published joints and deviations."""
-
-    def __init__(self) -> None:
-        self._posture = LivePosture.load("default")
-
-    def __call__(self, positions: Floats, sigma: Floats, root: Floats) -> Floats:
-        """Return the covariance (B, 3, 3), rad², of rotations about the axes of the positions' frame, of joints (B, 22,
-        3) metres, deviations (B, 22) along an axis and orientations of the pelvis (B, 3, 3)."""
-        bones = positions - positions[:, PARENT]
-        bones[:, 0] = 0.0
-        expected = self._posture(positions, sigma, np.linalg.norm(bones, axis=-1))
-        known = self._posture.root(expected).covariance + np.diag(WITHIN**2)
-        rigid = rigid_covariance(sigma, bones @ root)
-        covariance = DEPENDENT * known @ np.linalg.inv(known + rigid) @ rigid + LEAST_SIGMA**2 * np.eye(3)
-        return root @ covariance @ root.swapaxes(-1, -2)
 
 
 @njit(cache=True)
@@ -379,49 +331,3 @@ def _to_unit(vector):
 def body_size(offsets: Floats) -> Floats:
     """(B,) total length of bones (B, 22, 3), relative to the rest skeleton's."""
     return np.linalg.norm(offsets, axis=-1).sum(axis=-1) / _REST_SIZE
-
-
-def rigid_pelvis(positions: Floats, offsets: Floats) -> Floats:
-    """(B, 3, 3) least squares rotation from the pelvis' bones (B, 22, 3) to its joints (B, 22, 3) (Kabsch)."""
-    observed = positions[:, list(_CARRIED)] - positions[:, :1]
-    u, _, vt = np.linalg.svd(observed.swapaxes(-1, -2) @ offsets[:, list(_CARRIED)])
-    u[..., -1] *= np.linalg.det(u @ vt)[:, None]
-    return u @ vt
-
-
-def rigid_covariance(sigma: Floats, offsets: Floats) -> Floats:
-    """(B, 3, 3) rad², covariance of `rigid_pelvis` in the pelvis' own axes, for joint deviations ``sigma`` (B, 22)
-    metres.
-
-    To first order, the rotation vector is M^-1 sum(b x e) for bones b and errors e, with M = sum(|b|² I - b b^T).
-    """
-    moved, moments = np.empty((2, len(offsets), 3, 3))
-    _moments(np.fmax(np.fmin(sigma, MAX_SIGMA), MIN_SIGMA), offsets, moved, moments)
-    inverse = np.linalg.inv(moments)
-    return inverse @ moved @ inverse
-
-
-@njit(cache=True)
-def _moments(sigma, offsets, moved, moments):
-    """Write the sums over bones b of |b|² I - b b^T, weighted by the joints' errors, and unweighted."""
-    whole = np.empty(3)  # the pelvis' own error affects all its bones
-    for row in range(len(offsets)):
-        for i in range(3):
-            whole[i] = 0.0
-            for joint in _CARRIED:
-                whole[i] += offsets[row, joint, i]
-            for j in range(3):
-                moved[row, i, j], moments[row, i, j] = 0.0, _LEAST if i == j else 0.0
-        _add_moment(whole, sigma[row, 0] ** 2, moved[row])
-        for joint in _CARRIED:
-            _add_moment(offsets[row, joint], sigma[row, joint] ** 2, moved[row])
-            _add_moment(offsets[row, joint], 1.0, moments[row])
-
-
-@njit(cache=True)
-def _add_moment(bone, weight, moments):
-    square = bone[0] ** 2 + bone[1] ** 2 + bone[2] ** 2
-    for i in range(3):
-        for j in range(3):
-            moments[i, j] -= weight * bone[i] * bone[j]
-        moments[i, i] += weight * square

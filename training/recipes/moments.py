@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from steadypose.prior.body.skeleton import HIPS, MIRROR, SHOULDERS
-from steadypose.prior.models.posture import DIMENSIONS, TURNS, body_size, rigid_pelvis, trunk_frame
+from steadypose.prior.models.pelvis import rigid_pelvis
+from steadypose.prior.models.posture import DIMENSIONS, TURNS, body_size, trunk_frame
 from steadypose.prior.models.weights import LICENCES
 from steadypose.training.data.dataset import MotionSet
 from steadypose.training.data.recordings import Motion, load_motion, write_arrays

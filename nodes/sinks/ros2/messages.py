@@ -25,7 +25,7 @@ from steadypose.nodes.sinks.drawing import ALL_BONES
 from steadypose.nodes.sinks.ros2.rep155 import Links, body_name, frames, joint_angles, joint_rotations, measures, urdf
 from steadypose.prior.body.kinematics import rotation_matrix
 from steadypose.prior.body.skeleton import J
-from steadypose.prior.models.posture import RootCovariance
+from steadypose.prior.models.pelvis import RootCovariance
 
 MARKER_LIFE_S = 0.5
 JOINT_SIZE, BONE_WIDTH, TEXT_SIZE = 0.05, 0.02, 0.12  # sizes of markers, metres

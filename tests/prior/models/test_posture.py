@@ -8,8 +8,10 @@ from tests.helpers.bodies import fk, random_pose
 
 from steadypose.prior.body.kinematics import to_rotation_vectors
 from steadypose.prior.body.skeleton import HIPS, JOINTS, PARENT, REST_OFFSETS, REST_POSITIONS, SHOULDERS, J
+from steadypose.prior.models import pelvis
 from steadypose.prior.models import posture as stage
-from steadypose.prior.models.posture import LENGTH_SIGMA, LivePosture, RootCovariance, on_bones, rigid_pelvis
+from steadypose.prior.models.pelvis import RootCovariance, rigid_pelvis
+from steadypose.prior.models.posture import LENGTH_SIGMA, LivePosture, on_bones
 
 BODIES = 60
 POSED = [*HIPS, *SHOULDERS]
@@ -137,7 +139,7 @@ def test_the_answer_turns_with_the_body_however_it_lies(posture: LivePosture, jo
 def _root(posture: LivePosture, joints: np.ndarray, sigma: float) -> np.ndarray:
     deviations = np.full((BODIES, 22), sigma)
     root = posture.root(posture(joints, deviations, LENGTHS))
-    return stage.average_root(root, joints, deviations, OFFSETS)
+    return pelvis.average_root(root, joints, deviations, OFFSETS)
 
 
 def _angles(turned: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -169,7 +171,7 @@ def test_the_covariance_of_the_root_is_honest(posture: LivePosture, joints: np.n
 def test_a_perfect_root_is_said_to_be_as_sure_as_any(posture: LivePosture, joints: np.ndarray) -> None:
     root = _root(posture, joints, 0.0)
     covariance = RootCovariance()(joints, np.zeros((BODIES, 22)), root)
-    expected = np.broadcast_to(stage.LEAST_SIGMA**2 * np.eye(3), covariance.shape)
+    expected = np.broadcast_to(pelvis.LEAST_SIGMA**2 * np.eye(3), covariance.shape)
     np.testing.assert_allclose(covariance, expected, atol=1e-6)
 
 
@@ -186,5 +188,5 @@ def test_its_covariance_is_the_spread_of_noisy_pelvises() -> None:
     bones = np.broadcast_to(REST_OFFSETS, (count, 22, 3))
     noisy = rigid_pelvis(fk(turns) + rng.normal(0.0, 1.0, (count, 22, 3)) * sigma[..., None], bones)
     spread = np.cov(Rotation.from_matrix(turns[:, 0].swapaxes(-1, -2) @ noisy).as_rotvec().T)
-    stated = stage.rigid_covariance(sigma[:1], bones[:1])[0]
+    stated = pelvis.rigid_covariance(sigma[:1], bones[:1])[0]
     np.testing.assert_allclose(stated, spread, atol=0.06 * np.trace(spread))
